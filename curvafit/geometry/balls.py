@@ -41,27 +41,33 @@ NEAR = 8
 # on the distance, would be slower. Signs of the squares hold both sides in one array.
 
 
-def square_distances(
-    mask: np.ndarray, steps: Sequence[float] | np.ndarray, reach: float, *, offset: float = 0.0, both: bool = False
+def border_distance(
+    mask: np.ndarray,
+    spacing: Sequence[float],
+    limit: float = math.inf,
+    *,
+    offset: float = 0.0,
+    both: bool = False,
 ) -> np.ndarray:
-    """Return the squared distance of each voxel's centre in a mask to the nearest voxel outside; float32 (Z, Y, X).
+    """Return the distance of each voxel of a mask to the nearest voxel outside, at most `limit`; float32 (Z, Y, X).
 
-    `steps` are a voxel's edges along z, y and x; squares are at most `reach`², in the same unit. Distances end `offset`
-    voxels before the outer voxel's centre: 0.5 is at its face. Outside the mask squares are 0, or with `both` minus the
-    squared distances to the mask.
+    Distances are exact, from centre to centre, in spacing's unit. They end `offset` voxels before the outer voxel's
+    centre: 0.5 is at its face. Outside the mask they are 0, or with `both` minus the distances to the mask.
     """
-    squares = np.empty(mask.shape, dtype=np.float32)
-    scratch = np.empty((max(mask.shape), _COLUMNS), dtype=np.float32)
-    edges = np.asarray(steps, dtype=np.float32)
-    _square_distances(np.ascontiguousarray(mask), edges, np.float32(reach), np.float32(offset), both, squares, scratch)
-    return squares
+    edge = float(min(spacing))
+    steps = np.array(spacing, dtype=np.float32) / np.float32(edge)
+    reach = min(limit / edge, 2.0 * math.hypot(*(n * h for n, h in zip(mask.shape, steps.tolist(), strict=True))))
+    distance = np.empty(mask.shape, dtype=np.float32)
+    scratch = np.zeros((max(mask.shape) + 2, _COLUMNS), dtype=np.float32)
+    lengths = np.float32(reach), np.float32(offset), np.float32(edge)
+    _measure_distances(np.ascontiguousarray(mask), steps, lengths, both, distance, scratch)
+    return distance
 
 
 @njit(cache=True, nogil=True)
-def _square_distances(mask, steps, reach, offset, both, squares, scratch):  # pragma: no cover
-    """Fill `squares` with the squared distances along x, then lower them along y and z; see `square_distances`."""
-    nz, ny, nx = mask.shape
-    hz, hy, hx = steps
+def _measure_distances(mask, steps, lengths, both, squares, scratch):  # pragma: no cover
+    """Fill `squares` with squared distances along x, lower them along y and z, and take their roots times an edge."""
+    (nz, ny, nx), (hz, hy, hx), (reach, offset, edge) = mask.shape, steps, lengths
     for z in range(nz):
         for y in range(ny):
             _fill_row(mask[z, y], hx, reach, offset, both, squares[z, y])
@@ -71,6 +77,9 @@ def _square_distances(mask, steps, reach, offset, both, squares, scratch):  # pr
     for y in range(ny):
         for first in range(0, nx, _COLUMNS):
             _lower_columns(squares[:, y, first : first + _COLUMNS], hz, offset, scratch)
+    for z in range(nz):
+        for y in range(ny):
+            _take_roots(squares[z, y], edge)
 
 
 @njit(cache=True)
@@ -88,44 +97,41 @@ def _fill_row(mask, step, reach, offset, both, squares):  # pragma: no cover
         squares[x] = square if mask[x] else -square if both else np.float32(0)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True)
 def _lower_columns(squares, step, offset, scratch):  # pragma: no cover
     """Lower squares (n, columns) of distances, negative outside, to the least of ((k - offset) step)² plus the square k
     voxels away in the column; `offset` is the border's distance from a voxel's centre."""
     n, width = squares.shape
-    zero, one = np.float32(0), np.float32(1)
+    zero, one, columns = np.float32(0), np.float32(1), scratch.shape[1]
     scratch[:n, :width] = squares
+    best, sign = scratch[n], scratch[n + 1]
     for row in range(n):
+        largest, k, cost = zero, 1, ((one - offset) * step) ** 2
+        for i in range(columns):
+            sign[i] = -one if scratch[row, i] < zero else one
+            best[i] = sign[i] * scratch[row, i]
+            largest = max(largest, best[i])
+        while cost < largest and (row - k >= 0 or row + k < n):
+            before, after = scratch[max(row - k, 0)], scratch[min(row + k, n - 1)]  # an end is nearer than it counts
+            for i in range(columns):  # a voxel of the other side is at distance 0
+                other = cost + max(min(sign[i] * before[i], sign[i] * after[i]), zero)
+                best[i] = min(best[i], other)
+            k += 1
+            cost = ((np.float32(k) - offset) * step) ** 2
+            if k % 4 == 0:
+                largest = best.max()
         for i in range(width):
-            sign = -one if scratch[row, i] < 0 else one
-            best, k, cost = sign * scratch[row, i], 1, ((one - offset) * step) ** 2
-            while cost < best and (row - k >= 0 or row + k < n):
-                if row - k >= 0:  # a voxel of the other side is at distance 0
-                    best = min(best, cost + max(sign * scratch[row - k, i], zero))
-                if row + k < n:
-                    best = min(best, cost + max(sign * scratch[row + k, i], zero))
-                k += 1
-                cost = ((np.float32(k) - offset) * step) ** 2
-            squares[row, i] = sign * best
+            squares[row, i] = sign[i] * best[i]
+
+
+@njit(cache=True)
+def _take_roots(squares, edge):  # pragma: no cover
+    """Replace squares by their roots times an edge, with the same signs."""
+    for x in range(len(squares)):
+        squares[x] = math.copysign(math.sqrt(abs(squares[x])), squares[x]) * edge
 
 
 # ---- balls -----------------------------------------------------------------------------------------------------------
-
-
-def ball_radii(
-    mask: np.ndarray, spacing: tuple[float, float, float], limit: float = math.inf, *, both: bool = False
-) -> np.ndarray:
-    """Return the distance of each voxel of a mask to the nearest voxel outside, at most `limit`; float32 (Z, Y, X).
-
-    Distances are exact, from centre to centre, in spacing's unit. With `both`, those outside to the mask are negative.
-    """
-    edge = float(min(spacing))
-    steps = np.array(spacing, dtype=np.float32) / np.float32(edge)
-    reach = min(limit / edge, 2.0 * math.hypot(*(n * h for n, h in zip(mask.shape, steps.tolist(), strict=True))))
-    squares = square_distances(mask, steps, reach, both=both)
-    outside = np.signbit(squares) if both else False
-    np.sqrt(np.abs(squares, out=squares), out=squares)
-    return np.multiply(squares, np.where(outside, np.float32(-edge), np.float32(edge)), out=squares)
 
 
 def paint_coarse_balls(radius: np.ndarray, spacing: tuple[float, float, float], factor: int) -> np.ndarray:
@@ -169,8 +175,8 @@ def paint_balls(
     slack = 0.51 * edge + math.hypot(*steps)  # a ball's rim, and how far two voxels are from their cells' centres
     while largest > 0:  # in stages, each of which leaves few of the smaller balls to the next ones
         least, limit = _STAGE * largest if largest > edge else 0.0, 0.0 if periodic else largest + 2 * slack
-        squares = _measure_free(free[:, :, margin : -margin - _LANES], steps, limit)
-        order = _find_useful(radius, alive, squares, np.float32(slack), np.float32(least))
+        distance = _measure_free(free[:, :, margin : -margin - _LANES], steps, limit)
+        order = _find_useful(radius, alive, distance, np.float32(slack), np.float32(least))
         order = order[np.argsort(-balls[0][order], kind="stable")]
         _paint(order, balls, rows, np.array(radius.shape), steps, rim, periodic)
         largest = least
@@ -202,18 +208,18 @@ def _gap(index, low, high):  # pragma: no cover
 
 
 def _measure_free(free: np.ndarray, steps: np.ndarray, reach: float) -> np.ndarray:
-    """Return the squared distance of each cell of 2³ voxels to the nearest one with a free voxel; at most `reach`²."""
+    """Return the distance of each cell of 2³ voxels to the nearest one with a free voxel; at most `reach`."""
     cells = free.transpose(0, 2, 1)
     for axis in (0, 1):
         cells = np.bitwise_or.reduceat(cells, np.arange(0, cells.shape[axis], 2), axis)
     bits = np.unpackbits(cells.view(np.uint8), axis=2, bitorder="little")
-    return square_distances((bits[:, :, ::2] | bits[:, :, 1::2]) == 0, 2 * steps, reach)
+    return border_distance((bits[:, :, ::2] | bits[:, :, 1::2]) == 0, (2 * steps).tolist(), reach)
 
 
 @njit(cache=True, nogil=True)
-def _find_useful(radius, alive, squares, slack, least):  # pragma: no cover
+def _find_useful(radius, alive, distance, slack, least):  # pragma: no cover
     """Return the indices of balls that are alive, of more than the least radius and near a free voxel; those that are
-    not near are alive no longer. `squares` are those of `_measure_free`."""
+    not near are alive no longer. The `distance` is that of `_measure_free`."""
     nz, ny, nx = radius.shape
     found = np.empty(np.count_nonzero(alive), dtype=np.int64)
     count = 0
@@ -221,7 +227,7 @@ def _find_useful(radius, alive, squares, slack, least):  # pragma: no cover
         for y in range(ny):
             for x in range(nx):
                 if alive[z, y, x] and radius[z, y, x] > least:
-                    if squares[z // 2, y // 2, x // 2] <= (radius[z, y, x] + slack) ** 2:
+                    if distance[z // 2, y // 2, x // 2] <= radius[z, y, x] + slack:
                         found[count] = (z * ny + y) * nx + x
                         count += 1
                     else:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates
+from numba import njit
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
 from curvafit.core.runtime import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
-from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
+from curvafit.priors.curvature import XI, diffuse_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
 
@@ -184,7 +184,6 @@ def diagram(
     values = torch.as_tensor(u)
     values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
     mesh = _inner_surface(values, grid, margin)
-    kappa1, kappa2, resolved = _voxel_curvatures(values, grid, epsilon, curvature)
     weights, centres = areas(mesh), mesh.barycentres / np.array(grid.spacing)
     counted = weights >= LEAST_TRIANGLE * grid.voxel_volume ** (2 / 3)
     if where is not None:
@@ -192,7 +191,7 @@ def diagram(
     if not counted.any():
         raise NoSurface("expected a surface in the part that counts, got none")
     weights, centres = weights[counted], centres[counted]
-    points, kept = _interpolate((kappa1, kappa2), resolved, centres, grid.periodic)
+    points, kept = _interpolate_curvatures(values, grid, epsilon, curvature, centres)
     if not kept.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
     excluded = 1 - float(weights[kept].sum() / weights.sum())
@@ -200,13 +199,13 @@ def diagram(
     return Diagram(points[kept], weights[kept], excluded=excluded, places=places)
 
 
-def find_resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:
+def find_resolved(slope: Any, kappa1: Any, kappa2: Any, grid: Grid) -> Any:
     """Return, as bool, the voxels where the level set is defined and no radius of curvature is below a voxel.
 
-    `slope` is the norm of the gradient of `profile_distance`, 1 for a perfect profile.
+    `slope`, a tensor or an array, is the norm of the gradient of `profile_distance`, 1 for a perfect profile.
     """
     sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
-    return (slope > LEAST_SLOPE) & (kappa1.abs() < sharpest) & (kappa2.abs() < sharpest)
+    return (slope > LEAST_SLOPE) & (abs(kappa1) < sharpest) & (abs(kappa2) < sharpest)
 
 
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
@@ -221,29 +220,101 @@ def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
     return Surface(inner.vertices + m * np.array(grid.spacing), inner.faces)
 
 
-def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str) -> tuple[np.ndarray, ...]:
-    """Return κ1, κ2 of every voxel (0 where not resolved) and whether they are resolved, as 1 or 0."""
-    distance = jet(profile_distance(values, epsilon), grid)
-    if curvature == "geometric":
-        κ1, κ2, _, _ = geometric_curvatures(distance)
-    else:
-        κ1, κ2, _, _ = diffuse_curvatures(jet(values, grid), epsilon)
-    slope = distance.gradient.square().sum(-4).sqrt()
-    resolved = find_resolved(slope, κ1, κ2, grid)
-    fields = (torch.where(resolved, κ1, 0.0), torch.where(resolved, κ2, 0.0), resolved.to(values.dtype))
-    return tuple(field.detach().cpu().numpy() for field in fields)
-
-
-def _interpolate(
-    fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
+def _interpolate_curvatures(
+    values: Tensor, grid: Grid, epsilon: float, curvature: Kind, centres: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate two fields at `centres` `(N, 3)`, in voxels, from the resolved voxels around each, if there are any;
-    return values `(N, 2)` and whether there are. Fields are 0 elsewhere: sums over the resolved weight are means."""
-    *sums, total = (
-        map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
-        for values in (*fields, resolved)
-    )
-    return np.stack(sums, axis=1) / np.where(total > 0, total, 1)[:, None], total > 0
+    """Interpolate κ1, κ2 linearly at `centres` `(M, 3)`, in voxels, from the resolved voxels around each, if there are
+    any; return curvatures `(M, 2)` and whether there are."""
+    values, numbers = values.detach().cpu(), np.zeros(grid.shape, np.int32)
+    _mark_corners(centres, grid.periodic, numbers)
+    voxels = np.flatnonzero(numbers)
+    numbers.ravel()[voxels] = np.arange(len(voxels))
+    distance = profile_distance(values, epsilon)
+    if curvature == "geometric":
+        κ1, κ2, slope = _measure_levels(distance.contiguous().numpy(), grid.spacing, grid.periodic, voxels)
+    else:
+        slopes = jet(distance, grid).gradient.square().sum(-4).sqrt()
+        fields = (*diffuse_curvatures(jet(values, grid), epsilon)[:2], slopes)
+        κ1, κ2, slope = (field.flatten().numpy()[voxels] for field in fields)
+    return _interpolate(centres, grid.periodic, numbers, κ1, κ2, find_resolved(slope, κ1, κ2, grid))
+
+
+@njit(cache=True, nogil=True)
+def _mark_corners(centres, periodic, marks):  # pragma: no cover
+    """Set the marks of the voxels around places to 1."""
+    for centre in centres:
+        for corner in range(8):
+            z, y, x, _ = _find_corner(centre, corner, marks.shape, periodic)
+            marks[z, y, x] = 1
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(centres, periodic, numbers, κ1, κ2, resolved):  # pragma: no cover
+    """Interpolate at places between the resolved of the voxels around each, which have numbers."""
+    curvatures, known = np.zeros((len(centres), 2)), np.zeros(len(centres), np.bool_)
+    for k in range(len(centres)):
+        total = 0.0
+        for corner in range(8):
+            z, y, x, share = _find_corner(centres[k], corner, numbers.shape, periodic)
+            voxel = numbers[z, y, x]
+            if resolved[voxel] and share > 0:
+                total += share
+                curvatures[k, 0] += share * κ1[voxel]
+                curvatures[k, 1] += share * κ2[voxel]
+        known[k] = total > 0
+        if total > 0:
+            curvatures[k] /= total
+    return curvatures, known
+
+
+@njit(cache=True, inline="always")
+def _find_corner(place, corner, shape, periodic):  # pragma: no cover
+    """Return one of the eight voxels (z, y, x) around a place, and its weight in a linear interpolation."""
+    below = np.floor(place[0]), np.floor(place[1]), np.floor(place[2])
+    upper = corner >> 2, corner >> 1 & 1, corner & 1
+    share = 1.0
+    for axis in range(3):
+        part = place[axis] - below[axis]
+        share *= part if upper[axis] else 1 - part
+    z = _continue(int(below[0]) + upper[0], shape[0], periodic)
+    y = _continue(int(below[1]) + upper[1], shape[1], periodic)
+    return z, y, _continue(int(below[2]) + upper[2], shape[2], periodic), share
+
+
+@njit(cache=True, inline="always")
+def _continue(k, n, periodic):  # pragma: no cover
+    """Return the voxel 0 … n - 1 that a voxel up to one beyond them is a copy, or the mirror image, of."""
+    if 0 <= k < n:
+        return k
+    return k % n if periodic else min(max(k, 0), n - 1)
+
+
+@njit(cache=True, nogil=True)
+def _measure_levels(u, spacing, periodic, voxels):  # pragma: no cover
+    """Return κ1 and κ2 as `priors.curvature.geometric_curvatures` has them, and |∇u|, at voxels, flat indices."""
+    (nz, ny, nx), (hz, hy, hx) = u.shape, spacing
+    κ1, κ2, slope = np.empty(len(voxels)), np.empty(len(voxels)), np.empty(len(voxels))
+    for k in range(len(voxels)):
+        z, y, x = voxels[k] // nx // ny, voxels[k] // nx % ny, voxels[k] % nx
+        a, A = _continue(z - 1, nz, periodic), _continue(z + 1, nz, periodic)
+        b, B = _continue(y - 1, ny, periodic), _continue(y + 1, ny, periodic)
+        c, C = _continue(x - 1, nx, periodic), _continue(x + 1, nx, periodic)
+        twice = 2.0 * u[z, y, x]
+        gz, zz = (u[A, y, x] - u[a, y, x]) / (2 * hz), (u[A, y, x] - twice + u[a, y, x]) / hz**2
+        gy, yy = (u[z, B, x] - u[z, b, x]) / (2 * hy), (u[z, B, x] - twice + u[z, b, x]) / hy**2
+        gx, xx = (u[z, y, C] - u[z, y, c]) / (2 * hx), (u[z, y, C] - twice + u[z, y, c]) / hx**2
+        zy = (u[A, B, x] + u[a, b, x] - u[A, b, x] - u[a, B, x]) / (4 * hz * hy)
+        zx = (u[A, y, C] + u[a, y, c] - u[A, y, c] - u[a, y, C]) / (4 * hz * hx)
+        yx = (u[z, B, C] + u[z, b, c] - u[z, B, c] - u[z, b, C]) / (4 * hy * hx)
+        square = gz * gz + gy * gy + gx * gx
+        length2 = square + XI * XI
+        normal = gz * (gz * zz + 2 * (gy * zy + gx * zx)) + gy * (gy * yy + 2 * gx * yx) + gx * gx * xx
+        adjugate = gz * gz * (yy * xx - yx * yx) + gy * gy * (zz * xx - zx * zx) + gx * gx * (zz * yy - zy * zy)
+        adjugate += 2 * gz * (gy * (zx * yx - zy * xx) + gx * (zy * yx - zx * yy)) + 2 * gy * gx * (zy * zx - zz * yx)
+        H = -(zz + yy + xx - normal / length2) / math.sqrt(length2)
+        root = math.sqrt(max(H * H - 4 * adjugate / length2**2, 0.0))
+        κ1[k], κ2[k], slope[k] = (H + root) / 2, (H - root) / 2, math.sqrt(square)
+    return κ1, κ2, slope
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:

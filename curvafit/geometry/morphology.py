@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.core.schema import Rule
-from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
+from curvafit.geometry.balls import border_distance, paint_balls, paint_coarse_balls
 from curvafit.geometry.mesh import Surface, areas, march
 from curvafit.geometry.topology import euler_number, euler_of_window
 
@@ -121,7 +121,7 @@ def local_thickness(
     for width in _WRAPPED if periodic else (0,):  # the second margin is tried where balls are wider than the first
         margin = [min(n // 2, width) for n in mask.shape]
         inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
-        radius = ball_radii(np.pad(mask, [(m, m) for m in margin], mode="wrap"), spacing)
+        radius = border_distance(np.pad(mask, [(m, m) for m in margin], mode="wrap"), spacing)
         if radius[inner].max() < width * edge:
             break
     factor = math.ceil(float(radius[inner].max()) / edge / largest)
@@ -151,9 +151,15 @@ def soften(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
     mask = mask.astype(np.float32)
     if periodic:
         return ndimage.gaussian_filter(mask, 0.7, mode="wrap")
-    flat, sloped = np.pad(mask, SOFTENED, "edge"), np.pad(mask, SOFTENED, "reflect", reflect_type="odd")
-    inner = tuple(slice(SOFTENED, SOFTENED + n) for n in mask.shape)
-    return np.ascontiguousarray(ndimage.gaussian_filter(flat + SLOPE * (sloped - flat), 0.7)[inner])
+    padded, inner = np.pad(mask, SOFTENED), tuple(slice(SOFTENED, SOFTENED + n) for n in mask.shape)
+    low, high = slice(SOFTENED), slice(-SOFTENED, None)
+    for axis in range(3):
+        values, margins = np.moveaxis(mask, axis, 0), np.moveaxis(padded, axis, 0)
+        for margin, end in ((low, values[: SOFTENED + 1]), (high, values[-SOFTENED - 1 :])):
+            flat = np.pad(end, SOFTENED, "edge")[margin]
+            sloped = np.pad(end, SOFTENED, "reflect", reflect_type="odd")[margin]
+            margins[margin] = flat + SLOPE * (sloped - flat)
+    return np.ascontiguousarray(ndimage.gaussian_filter(padded, 0.7)[inner])
 
 
 def border_weights(positions: np.ndarray, shape: Sequence[int]) -> np.ndarray:

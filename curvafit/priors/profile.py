@@ -40,7 +40,8 @@ def optimal_profile(distance: Tensor, epsilon: float) -> Tensor:
 def profile_distance(u: Tensor, epsilon: float, limit: float = 3.0) -> Tensor:
     """Return the signed distance √2 ε artanh(u), which `optimal_profile` maps to `u`, clipped to ±`limit`·√2 ε."""
     bound = math.tanh(limit)
-    return math.sqrt(2) * epsilon * torch.atanh(u.clamp(-bound, bound))
+    v = u.clamp(-bound, bound)
+    return epsilon / math.sqrt(2) * (torch.log1p(v) - torch.log1p(-v))  # 2 artanh: logarithms are vectorised
 
 
 def signed_distance(

@@ -24,12 +24,12 @@ from curvafit.core.units import convert_length, format_number, plain_unit, power
 from curvafit.geometry.description import descriptors
 from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families, join_diagrams
 from curvafit.geometry.mesh import NoSurface, Surface, fabric
-from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
+from curvafit.geometry.morphology import border_weights, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.kernels.threads import count_threads, one_thread
 from curvafit.scan import preparation
-from curvafit.scan.grids import median_thickness, remove_specks
+from curvafit.scan.grids import Thickness, median_thickness, remove_specks
 from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
 from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes
@@ -333,14 +333,15 @@ def measure_maps(
     progress("finding the structure", 0.0)
     detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
     progress("measuring thickness and curvature", 0.1)
-    alone, measure = count_threads() == 1, partial(_measure_voxels, detected, signed, periodic)
+    alone, thickness = count_threads() == 1, Thickness()
+    measure = partial(_measure_voxels, detected, signed, periodic, thickness)
     with one_thread(), ThreadPoolExecutor(1) as pool:  # each of the two works has a thread, where there are two
         others = None if alone else pool.submit(measure)
         try:
             if most is None:
                 prepared = preparation.prepare(field, kind=detected, **options)
             else:
-                prepared = preparation.prepare_whole(detected, signed, periodic, most)
+                prepared = preparation.prepare_whole(detected, signed, periodic, most, thickness)
             curved, diagram = measure_curvatures(prepared)
             of_curvature, lost = prepared.notes, ()
         except ValueError as reason:
@@ -353,10 +354,14 @@ def measure_maps(
     return Maps(field.spacing, mask, *voxels, curved, diagram, detected, notes)  # type: ignore[call-arg]
 
 
-def _measure_voxels(kind: Kind, signed: Volume, periodic: bool) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+def _measure_voxels(
+    kind: Kind, signed: Volume, periodic: bool, measure: Thickness
+) -> tuple[tuple[Any, ...], tuple[str, ...]]:
     """Return mask, thickness, gap, shares of χ and surface of a scan's structure, as `Maps` has them, and notes."""
-    mask, notes = _drop_specks(kind, signed, periodic)
-    thickness, gap = (local_thickness(phase, signed.spacing, periodic=periodic) for phase in (mask, ~mask))
+    mask, notes = _drop_specks(kind, signed, periodic, measure)
+    more = bool(mask.mean() > preparation.HALF)  # of the phase that fills more: another thread begins with the other
+    thick = {side: measure(mask == side, signed.spacing, periodic=periodic) for side in (more, not more)}
+    thickness, gap = thick[True], thick[False]
     surface = measure_surface(mask, signed.spacing, periodic)
     return (mask, thickness, gap, euler_shares(mask, periodic=periodic), surface), notes
 
@@ -368,11 +373,11 @@ def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarra
     return (np.zeros((0, 3)), columns), empty, (f"No curvature: {reason}.",)
 
 
-def _drop_specks(kind: Kind, signed: Volume, periodic: bool) -> tuple[np.ndarray, tuple[str, ...]]:
+def _drop_specks(kind: Kind, signed: Volume, periodic: bool, measure: Thickness) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the structure as a mask on the scan's voxels (of an image, without specks and pinholes), and notes."""
     mask, notes = signed.values > 0, signed.notes
     if kind == "image":
-        thickness = median_thickness(mask, signed.spacing, periodic)[0]
+        thickness = median_thickness(mask, signed.spacing, periodic, measure)[0]
         smallest = preparation.smallest_piece(thickness) / math.prod(signed.spacing)
         mask, specks, pinholes = remove_specks(mask, smallest, periodic)
         if specks or pinholes:

@@ -13,6 +13,7 @@ import torch
 
 from curvafit.core.units import convert_length
 from curvafit.geometry.diagrams import Diagram
+from curvafit.geometry.morphology import local_thickness
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, Law, phase_field
 from curvafit.priors.grid import Boundary
@@ -269,9 +270,12 @@ def make_start(
     return grid, values if kind == "field" else phase_field(values > 0, grid, epsilon), signed.notes
 
 
-def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:
+def prepare_whole(
+    kind: Kind, signed: Volume, periodic: bool, most: int, measure: Callable[..., np.ndarray] = local_thickness
+) -> Prepared:
     """Put all of a scan on the working grid, without measuring blur and noise; `signed` is above 0 in the structure
-    (`structure.find_structure`). Raises TooLarge where that takes more than `most` working voxels."""
+    (`structure.find_structure`), whose thickness `measure` returns. Raises TooLarge where that takes more than `most`
+    working voxels."""
 
     def take_all(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
         shape = count_voxels(scan.field.shape, scale)
@@ -279,7 +283,7 @@ def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prep
             raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(shape)}")
         return (0, 0, 0), shape, ()
 
-    return _put_on_grid(_Scan(kind, signed, periodic, None, one_scale=False), take_all)
+    return _put_on_grid(_Scan(kind, signed, periodic, None, one_scale=False, measure=measure), take_all)
 
 
 @dataclass(frozen=True)
@@ -291,6 +295,7 @@ class _Scan:
     periodic: bool
     region: np.ndarray | None
     one_scale: bool
+    measure: Callable[..., np.ndarray] = local_thickness
 
     @property
     def counted(self) -> np.ndarray:
@@ -315,7 +320,7 @@ def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, f
     noise = scan.kind != "field" and structure.is_noise(scan.field.values > 0)
     keeps_grid = scan.kind == "field" or noise  # a phase field has its ε, and noise no thickness
     thinner, name = scan.thinner
-    thickness, thick = grids.median_thickness(thinner, spacing, scan.periodic)
+    thickness, thick = grids.median_thickness(thinner, spacing, scan.periodic, scan.measure)
     thickness_note = judge_thickness(name, thickness, thick, spacing, keeps_grid)
     kept = KEPT_FOR_LAWS if scan.one_scale else KEPT
     scale, why = choose_scale(scan.field.shape, spacing, thickness, keeps_grid, kept=kept, periodic=scan.periodic)

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from curvafit.geometry.balls import ball_radii
+from curvafit.geometry.balls import border_distance
 from curvafit.scan import preparation
 from curvafit.scan import structure as splitting
 from curvafit.scan.grids import MEASURED, candidate_boxes, pick_box, surface_voxels, thickness_beneath
@@ -104,7 +104,7 @@ def _measure_thickness(plan: Plan, box: Box, inside: bool) -> tuple[float, float
     mask, surface = (voxels[within(box, around)] for voxels in (phase, surface_voxels(phase)))
     median, thick = thickness_beneath(mask, surface, spacing)
     half = max(n * h for n, h in zip(mask.shape, spacing, strict=True)) / 2
-    reach = float(np.abs(ball_radii(mask, spacing, half, both=True)).max())
+    reach = float(np.abs(border_distance(mask, spacing, half, both=True)).max())
     return median, thick, replace(plan, reach=max(plan.reach, reach))
 
 

@@ -20,7 +20,7 @@ from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, check_memory, memory, silent
 from curvafit.core.units import format_sampling
 from curvafit.core.workers import Cluster
-from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
+from curvafit.geometry.balls import NEAR, border_distance, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagrams import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, march
 from curvafit.geometry.morphology import SOFTENED, border_weights, connectivity_density, measure_connectivity, soften
@@ -333,7 +333,7 @@ def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
     while True:  # until all balls that overlap the core are whole
         box, mask, pieces = _find_structure(plan, core, distance)
         inner = within(core, box)
-        signed = ball_radii(mask, spacing, WIDEST * finest, both=True)
+        signed = border_distance(mask, spacing, WIDEST * finest, both=True)
         radii = [np.maximum(signed, 0), np.maximum(-signed, 0)]
         del signed
         largest = [reaching_radius(radius, spacing, inner) for radius in radii]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from curvafit.geometry.balls import ball_radii, paint_balls
+from curvafit.geometry.balls import border_distance, paint_balls
 from curvafit.geometry.morphology import local_thickness, morphometry
 from curvafit.geometry.topology import betti_numbers, euler_number, euler_of_window
 from curvafit.volumes.read import load
@@ -84,7 +84,7 @@ def test_balls_are_painted_by_the_rule(spacing: tuple[float, float, float], peri
     """One by one, in descending size, unless one sticks out of the ball that painted its centre by less than half the
     finest edge or a twentieth: across words of 64 voxels, and beside a box that repeats."""
     mask = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal((10, 11, 100)), 2.0) > -0.02
-    radius = np.minimum(ball_radii(mask, spacing), 3.0)
+    radius = np.minimum(border_distance(mask, spacing), 3.0)
     places, finest = np.argwhere(np.ones(mask.shape)), min(spacing)
     flat = radius.ravel()
     painted, owner = np.zeros(mask.size, np.float32), np.full(mask.size, -1)

@@ -12,9 +12,10 @@ from scipy import ndimage
 from shapes import grown
 
 from curvafit.geometry.diagrams import diagram
-from curvafit.priors import Grid, phase_field
+from curvafit.priors import Grid, phase_field, profile
 from curvafit.scan import preparation as preparing
 from curvafit.scan.grids import (
+    _restore_signs,
     box_by_surface,
     candidate_boxes,
     centre_distance,
@@ -122,6 +123,17 @@ def test_what_is_thick_is_smoothed_more_widely(radius: int, share: float) -> Non
         errors.append(found.weights @ ((found.points * radius - 1) ** 2).sum(1))
     assert errors[1] < share**2 * errors[0]
     assert found.mean().mean() * radius == pytest.approx(1, abs=0.06 if radius == 4 else 0.02)
+
+
+def test_few_gaussians_restore_signs_as_blurs_of_all_voxels_do() -> None:
+    """Up to the faces, beyond which both continue as a mirror image."""
+    noise = np.random.default_rng(0)
+    distance = noise.standard_normal((18, 20, 31)).astype(np.float32)
+    mask = (distance > 0) != (noise.random(distance.shape) < 0.01)
+    voxels = Grid(mask.shape, (1.0, 1.0, 1.0), "replicate")
+    expected = profile._restore_signs(torch.from_numpy(distance), torch.from_numpy(mask), voxels)
+    _restore_signs(distance, mask)
+    assert np.abs(distance - expected.numpy()).max() < 1e-4
 
 
 def test_a_periodic_mask_is_profiled_without_a_seam_and_thin_plates_survive() -> None:

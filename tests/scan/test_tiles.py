@@ -11,7 +11,7 @@ from scipy import ndimage
 from shapes import grown
 
 from curvafit.core.workers import cluster
-from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
+from curvafit.geometry.balls import border_distance, paint_balls, paint_coarse_balls
 from curvafit.geometry.morphology import local_thickness
 from curvafit.scan import tiles
 from curvafit.scan.instances import OF_BODIES, measure_instances
@@ -88,7 +88,7 @@ def test_wide_balls_are_those_of_the_whole() -> None:
     mask = np.zeros((104, 70, 66), dtype=bool)
     for row, column in ((6, 8), (64, 60), (62, 6), (8, 58)):
         mask |= np.hypot(y - row, x - column - 3 * np.sin(z / 12)) < 5
-    assert 24 < ball_radii(~mask, (1.0, 1.0, 1.0)).max() < tiles.WIDEST
+    assert 24 < border_distance(~mask, (1.0, 1.0, 1.0)).max() < tiles.WIDEST
     scan = Volume(mask.astype(np.uint8))
     check_alike(measure(scan, tile=52), measure(scan))
 
@@ -105,7 +105,7 @@ def test_a_label_is_measured_in_tiles() -> None:
 def test_balls_of_a_core_are_those_of_the_whole(spacing: tuple[float, float, float]) -> None:
     mask, core = texture((50, 48, 44)) > 0, (slice(20, 34), slice(18, 30), slice(10, 20))
     for phase in (mask, ~mask):
-        radius = ball_radii(phase, spacing)
+        radius = border_distance(phase, spacing)
         assert radius == pytest.approx(ndimage.distance_transform_edt(phase, sampling=spacing), rel=1e-6)
         whole = paint_balls(radius, spacing)
         assert np.array_equal(2 * whole, local_thickness(phase, spacing))
