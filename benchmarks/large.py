@@ -21,7 +21,7 @@ from benchmarks.harness import Cases, Figure, Values, run_python, show
 from curvafit.core.files import remove
 from curvafit.segmentation.result import hidden_store
 
-#: Distance of known slices, and the longest side of a volume that is filled at once unless blocks have an edge.
+#: Distance of known slices, and the longest side of a volume that is filled in one piece.
 EVERY, WHOLE = 8, 256
 #: Steps of `segment`: the time of one step does not depend on their number.
 STEPS = 5
@@ -55,15 +55,16 @@ def write_scan(edge: int, path: Path, cases: Cases, *, labels: bool = False) -> 
 
 def timed(job: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Values:
     """Return the seconds and the memory in GB of one command."""
-    fills, tile = job == "reconstruct", ("--tile", 2 * EDGE) if edge <= WHOLE else ()
+    fills = job == "reconstruct"
     path = cases.folder / f"{'labels' if fills else 'scan'}-{edge}.zarr"
     write_scan(edge, path, cases, labels=fills)
-    crew = ("--workers", workers)
+    workers = 0 if fills and edge <= WHOLE else workers  # it is filled in one piece
+    crew = ("--workers", workers) if workers else ()
     how = {
         "measure": (*crew, "-o", cases.folder / f"measured-{edge}.csv"),
         "infer": ("-o", cases.folder / f"fit-{edge}", *filter(None, [flag])),
         "segment": (*crew, "--steps", STEPS, "-o", cases.folder / f"segmented-{edge}.zarr"),
-        "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{edge}.zarr"),
+        "reconstruct": (*crew, "--every", EVERY, "-o", cases.folder / f"filled-{edge}.zarr"),
     }[job]
     remove(hidden_store(cases.folder / f"filled-{edge}.zarr"))  # of a run that was stopped
     begun = time.monotonic()
