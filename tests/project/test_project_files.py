@@ -39,13 +39,30 @@ def text(name: str) -> str:
 
 def test_the_recipe_for_conda_asks_for_what_the_package_asks_for() -> None:
     recipe = yaml.safe_load(text("conda/recipe.yaml"))
-    assert recipe["context"]["version"] == curvafit.__version__
-    wanted = {Requirement(each).name: str(Requirement(each).specifier) for each in PROJECT["dependencies"]}
-    given = dict(each.split(" ", 1) for each in recipe["requirements"]["run"])
+    assert recipe["context"]["version"] == curvafit.__version__ and recipe["package"]["name"] == PROJECT["name"]
+    agrees_with_project(recipe["requirements"]["run"], recipe["build"]["python"]["entry_points"])
+    assert {tuple(each.split(" ", 1)) for each in recipe["requirements"]["host"]} >= {("hatchling", ">=1.27"), ("pip",)}
+
+
+def test_the_recipe_for_conda_renders() -> None:
+    """A package for every system, of one variant; what it runs with is what it asks for, after the renderer too."""
+    reason = "needs py-rattler-build, which is in no group: pip install py-rattler-build"
+    rattler_build = pytest.importorskip("rattler_build", reason=reason)
+    (made,) = rattler_build.Stage0Recipe.from_file(str(ROOT / "conda" / "recipe.yaml")).render()
+    recipe = made.recipe
+    assert (recipe.package.name, str(recipe.package.version)) == (PROJECT["name"], curvafit.__version__)
+    assert recipe.build.noarch == "python"
+    agrees_with_project(recipe.requirements.run, recipe.build.to_dict()["python"]["entry_points"])
+
+
+def agrees_with_project(run: list[str], commands: list[str]) -> None:
+    """Requirements and commands of a recipe are those of `pyproject.toml`, by the names that conda has for them."""
+    given = dict(each.split(" ", 1) for each in run)
     assert given.pop("python") == PROJECT["requires-python"]
-    names = {canonicalize_name(name): Requirement(f"x{bounds}").specifier for name, bounds in given.items()}
-    expected = {ELSEWHERE.get(name, canonicalize_name(name)): bounds for name, bounds in wanted.items()}
-    assert names == {name: Requirement(f"x{bounds}").specifier for name, bounds in expected.items()}
+    wanted = map(Requirement, PROJECT["dependencies"])
+    expected = {ELSEWHERE.get(each.name, canonicalize_name(each.name)): each.specifier for each in wanted}
+    assert {canonicalize_name(name): Requirement(f"x{bounds}").specifier for name, bounds in given.items()} == expected
+    assert commands == [f"{name} = {entry}" for name, entry in PROJECT["scripts"].items()]
 
 
 def test_one_version_everywhere() -> None:
