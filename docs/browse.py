@@ -3,28 +3,36 @@
     make docs && python docs/browse.py                   # needs PyQt6-WebEngine, which is Chromium; no network
 
 A page is wrong where a script reports an error, a picture does not load, the page is wider than its window, a figure to
-turn stays empty, or what can be clicked has no name for a screen reader or is not reached by the keyboard.
+turn stays empty, what can be clicked has no name for a screen reader or is not reached by the keyboard, or a slider's
+picture stays the same when an arrow key is pressed on it or the mouse drags it. `--pictures` keeps what each page looks
+like, above and at each slider.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 os.environ.setdefault("QTWEBENGINE_CHROMIUM_FLAGS", "--no-sandbox --disable-gpu")
 
-from PyQt6.QtCore import QTimer, QUrl
+from PyQt6.QtCore import QEventLoop, QPoint, Qt, QUrl
+from PyQt6.QtGui import QImage
+from PyQt6.QtTest import QTest
 from PyQt6.QtWebEngineCore import QWebEnginePage
 from PyQt6.QtWebEngineWidgets import QWebEngineView
 from PyQt6.QtWidgets import QApplication
 
 SITE = Path(__file__).resolve().parents[1] / "site"
 WIDTHS, HEIGHT = (1280, 390), 900
-#: Schemes of Material for MkDocs, and milliseconds until a page's scripts have drawn.
-SCHEMES, WAIT = ("default", "slate"), 900
+#: Schemes of Material for MkDocs, and milliseconds until a page's scripts have drawn, and a key has had its effect.
+SCHEMES, WAIT, SOON = ("default", "slate"), 900, 250
+#: Pixels of a drag, which is a few pictures of a strip.
+DRAG = 60
 #: Returns the faults of a page in a scheme, in words.
 FAULTS = """
 document.body.setAttribute("data-md-color-scheme", "%s");
@@ -35,13 +43,26 @@ const wide = document.documentElement.scrollWidth - window.innerWidth;
 const faults = wide > 1 ? [`${wide} pixels wider than the window`] : [];
 for (const image of document.images) if (image.complete && !image.naturalWidth) faults.push(`no picture ${image.src}`);
 for (const image of document.images) if (!image.hasAttribute("alt")) faults.push(`no words for ${image.src}`);
-for (const each of document.querySelectorAll("article :is(a[href], button, input, select)")) {
+for (const each of document.querySelectorAll("ieach:not([title])")) if (seen(each)) faults.push(`no title ${each.src}`);
+const content = document.querySelector("article") || document.body;
+for (const each of content.querySelectorAll("a[href], button, input, select")) {
   if (seen(each) && !name(each)) faults.push(`no name: ${each.outerHTML.slice(0, 80)}`);
   if (seen(each) && each.tabIndex < 0) faults.push(`not reached by the keyboard: ${each.outerHTML.slice(0, 80)}`);
 }
 for (const each of document.querySelectorAll("canvas")) if (seen(each) && !each.width) faults.push("an empty canvas");
 faults;
 """
+#: Returns how many sliders have a picture; and of one of these its name, and its picture's left, top, width and height.
+SLIDERS = """
+window.sliders = [...document.querySelectorAll("article :is(.turn[role=slider], .between input[type=range])")];
+sliders.length;
+"""
+AT = """(() => {
+const slider = sliders[%d], picture = (slider.closest(".between") || slider.parentNode).querySelector(".turn");
+picture.scrollIntoView({ block: "center", behavior: "instant" });
+const box = picture.getBoundingClientRect();
+return [slider.ariaLabel, ...[box.left, box.top, box.width, box.height].map(Math.round)];
+})()"""
 
 
 class Page(QWebEnginePage):
@@ -57,46 +78,87 @@ class Page(QWebEnginePage):
 
 
 class Browser:
-    """Opens pages one after the other, and keeps their faults."""
+    """Opens pages one after the other, and returns their faults."""
 
-    def __init__(self, app: QApplication, pages: list[Path]) -> None:
-        self.app, self.faults, self.count = app, dict[str, None](), len(pages)
-        self.jobs = [(page, width, scheme) for page in pages for width in WIDTHS for scheme in SCHEMES]
-        self.view = QWebEngineView()
+    def __init__(self, pictures: Path | None) -> None:
+        self.pictures, self.view = pictures, QWebEngineView()
         self.view.setPage(Page(self.view))
-        self.view.loadFinished.connect(lambda _: QTimer.singleShot(WAIT, self.ask))
         self.view.show()
 
-    def open(self) -> None:
-        if not self.jobs:
-            return self.app.quit()
-        page, width, _ = self.jobs[0]
+    def faults(self, page: Path, width: int, scheme: str) -> list[str]:
         self.view.resize(width, HEIGHT)
-        return self.view.load(QUrl.fromLocalFile(str(page)))
-
-    def ask(self) -> None:
-        self.view.page().runJavaScript(FAULTS % self.jobs[0][2], self.note)
-
-    def note(self, found: list[str] | None) -> None:
-        page, width, scheme = self.jobs.pop(0)
+        loop = QEventLoop()
+        self.view.loadFinished.connect(loop.quit)
+        self.view.load(QUrl.fromLocalFile(str(page)))
+        loop.exec()
+        self.view.loadFinished.disconnect(loop.quit)
+        QTest.qWait(WAIT)
+        found = self.run(FAULTS % scheme)
+        found = ["scripts cannot run"] if found is None else found
+        stem = "-".join(page.relative_to(SITE).with_suffix("").parts)
+        self.keep(f"{stem}-{width}-{scheme}")
+        for k in range(self.run(SLIDERS) or 0):
+            found += self.slide(k)
+            self.keep(f"{stem}-{width}-{scheme}-{k}")
         errors = self.view.page().errors
-        for fault in (*(found or ["scripts cannot run"] * (found is None)), *errors):
-            self.faults[f"{page.relative_to(SITE)} ({width}, {scheme}): {fault}"] = None
-        errors.clear()
-        self.open()
+        found, errors[:] = [*found, *errors], []
+        return found
+
+    def slide(self, k: int) -> list[str]:
+        """Press an arrow key on a slider, then drag its picture; return what did not change the picture."""
+        name, *box = self.run(AT % k)
+        QTest.qWait(SOON)
+        self.run(f"sliders[{k}].focus()")
+        faults = []
+        for way, act in (("the right arrow", self.press), ("a drag", self.drag)):
+            before = self.picture(box)
+            act(box)
+            QTest.qWait(SOON)
+            faults += [f"{way} does not change: {name}"] * (self.picture(box) == before)
+        return faults
+
+    def press(self, box: list[int]) -> None:
+        QTest.keyClick(self.view.focusProxy(), Qt.Key.Key_Right)
+
+    def drag(self, box: list[int]) -> None:
+        left, top, width, height = box
+        hand, middle = self.view.focusProxy(), QPoint(left + width // 2, top + height // 2)
+        QTest.mousePress(hand, Qt.MouseButton.LeftButton, pos=middle)
+        QTest.mouseMove(hand, middle + QPoint(DRAG, 0), 20)
+        QTest.mouseRelease(hand, Qt.MouseButton.LeftButton, pos=middle + QPoint(DRAG, 0), delay=20)
+
+    def picture(self, box: list[int]) -> QImage:
+        return self.view.grab().toImage().copy(*box)
+
+    def keep(self, name: str) -> None:
+        if self.pictures:
+            self.view.grab().save(str(self.pictures / f"{name}.png"))
+
+    def run(self, script: str) -> Any:
+        """Return a script's value, None where scripts cannot run."""
+        loop, values = QEventLoop(), []
+        self.view.page().runJavaScript(script, lambda value: (values.append(value), loop.quit()))
+        loop.exec()
+        return values[0]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", type=Path, help="by default all of site/")
+    parser.add_argument("--pictures", type=Path, help="a folder for pictures of the pages")
     options = parser.parse_args()
+    if options.pictures:
+        options.pictures.mkdir(parents=True, exist_ok=True)
     app = QApplication(sys.argv[:1])
-    browser = Browser(app, [page.resolve() for page in options.pages] or sorted(SITE.rglob("*.html")))
-    QTimer.singleShot(0, browser.open)
-    app.exec()
-    print("\n".join(browser.faults))
-    print(f"{len({fault.partition(' (')[0] for fault in browser.faults})} of {browser.count} pages are wrong")
-    sys.exit(bool(browser.faults))
+    browser, wrong = Browser(options.pictures), dict[Path, None]()
+    pages = [page.resolve() for page in options.pages] or sorted(SITE.rglob("*.html"))
+    for page, width, scheme in itertools.product(pages, WIDTHS, SCHEMES):
+        for fault in browser.faults(page, width, scheme):
+            print(f"{page.relative_to(SITE)} ({width}, {scheme}): {fault}", flush=True)
+            wrong[page] = None
+    print(f"{len(wrong)} of {len(pages)} pages are wrong")
+    del browser, app
+    sys.exit(bool(wrong))
 
 
 if __name__ == "__main__":

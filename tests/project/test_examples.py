@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import re
 import sys
 from collections.abc import Callable
 from itertools import pairwise
@@ -11,6 +12,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from curvafit.geometry.mesh import surface
 from curvafit.priors.law import preset
@@ -95,6 +97,23 @@ def test_interpolated_parameters(script) -> None:
         assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
     ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
+
+
+def test_the_gallerys_range_has_the_laws_of_its_strip(script) -> None:
+    """`docs/assets/turn.js` writes the numbers of laws between the page's two."""
+    turning = script("turning")
+    (pair,) = re.findall(
+        r'<figure class="between".*?</figure>',
+        (EXAMPLES.parent / "docs" / "gallery.md").read_text(encoding="utf-8"),
+        re.DOTALL,
+    )
+    for end, name in zip(("first", "last"), turning.ENDS, strict=True):
+        (stated,) = re.findall(rf'data-{end}="([^"]*)"', pair)
+        law = preset(name)
+        assert [float(number) for number in stated.split()] == pytest.approx([*law.coefficients, law.mass])
+    assert f'data-frames="{turning.LAWS}"' in pair
+    with Image.open(EXAMPLES.parent / "docs" / "gallery" / "between.webp") as strip:
+        assert strip.size == (turning.LAWS * turning.PIXELS, turning.PIXELS)
 
 
 def test_seeds_and_kept_shapes(run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
