@@ -34,12 +34,15 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# The notebooks run, and become pages with what they show; with EXECUTE= they become pages without it.
+# A page of shapes that grow here is made once. The notebooks run, and become pages with what they show; with EXECUTE= they become pages without it.
 EXECUTE ?= --execute
-docs: .venv/installed-dev
+docs: .venv/installed-dev docs/map/atlas.html
 	PYTHONWARNINGS=ignore $(BIN)/jupytext --quiet --to ipynb $(EXECUTE) docs/notebooks/*.py
 	$(BIN)/jupyter nbconvert --log-level WARN --to markdown docs/notebooks/*.ipynb
 	NO_MKDOCS_2_WARNING=1 PYTHONWARNINGS=ignore $(BIN)/python -m mkdocs build --strict --quiet
+
+docs/map/atlas.html: docs/atlas.py | .venv/installed-dev
+	PYTHONWARNINGS=ignore $(BIN)/python docs/atlas.py
 
 clean:
 	rm -rf .venv demo_out build dist site

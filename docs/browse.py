@@ -3,9 +3,9 @@
     make docs && python docs/browse.py                   # needs PyQt6-WebEngine, which is Chromium; no network
 
 A page is wrong where a script reports an error, a picture does not load, the page is wider than its window, a figure to
-turn stays empty, what can be clicked has no name for a screen reader or is not reached by the keyboard, or a slider's
-picture stays the same when an arrow key is pressed on it or the mouse drags it. `--pictures` keeps what each page looks
-like, above and at each slider.
+turn stays empty, what can be clicked has no name for a screen reader or is not reached by the keyboard, or a picture
+stays the same when an arrow key is pressed on its control or the mouse drags it. `--pictures` keeps what a page looks
+like, at its top and at each of these pictures.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ const name = each => (each.innerText || each.ariaLabel || each.title || each.alt
   || [...each.querySelectorAll("img[alt], svg, [title], [aria-label]")].length || [...(each.labels || [])].length;
 const wide = document.documentElement.scrollWidth - window.innerWidth;
 const faults = wide > 1 ? [`${wide} pixels wider than the window`] : [];
-for (const image of document.images) if (image.complete && !image.naturalWidth) faults.push(`no picture ${image.src}`);
+for (const image of document.images) if (image.src && !image.naturalWidth) faults.push(`no picture ${image.src}`);
 for (const image of document.images) if (!image.hasAttribute("alt")) faults.push(`no words for ${image.src}`);
 for (const each of document.querySelectorAll("ieach:not([title])")) if (seen(each)) faults.push(`no title ${each.src}`);
 const content = document.querySelector("article") || document.body;
@@ -52,16 +52,18 @@ for (const each of content.querySelectorAll("a[href], button, input, select")) {
 for (const each of document.querySelectorAll("canvas")) if (seen(each) && !each.width) faults.push("an empty canvas");
 faults;
 """
-#: Returns how many sliders have a picture; and of one of these its name, and its picture's left, top, width and height.
-SLIDERS = """
-window.sliders = [...document.querySelectorAll("article :is(.turn[role=slider], .between input[type=range])")];
-sliders.length;
+#: Returns how many controls have a picture; and of one its name, whether its picture can be dragged, and where that is.
+CONTROLS = """
+window.controls = [...document.querySelectorAll(".turn[role=slider], .between input[type=range], select#choose")];
+controls.length;
 """
 AT = """(() => {
-const slider = sliders[%d], picture = (slider.closest(".between") || slider.parentNode).querySelector(".turn");
+const control = controls[%d], figure = control.closest("figure") || document;
+const picture = figure.querySelector(".turn, #solid");
 picture.scrollIntoView({ block: "center", behavior: "instant" });
-const box = picture.getBoundingClientRect();
-return [slider.ariaLabel, ...[box.left, box.top, box.width, box.height].map(Math.round)];
+const { left, top, width, height } = picture.getBoundingClientRect();
+const place = [left, top, width, height].map(Math.round);
+return [control.ariaLabel || control.id, picture.matches(".turn"), ...place];
 })()"""
 
 
@@ -97,20 +99,20 @@ class Browser:
         found = ["scripts cannot run"] if found is None else found
         stem = "-".join(page.relative_to(SITE).with_suffix("").parts)
         self.keep(f"{stem}-{width}-{scheme}")
-        for k in range(self.run(SLIDERS) or 0):
-            found += self.slide(k)
+        for k in range(self.run(CONTROLS) or 0):
+            found += self.use(k)
             self.keep(f"{stem}-{width}-{scheme}-{k}")
         errors = self.view.page().errors
         found, errors[:] = [*found, *errors], []
         return found
 
-    def slide(self, k: int) -> list[str]:
-        """Press an arrow key on a slider, then drag its picture; return what did not change the picture."""
-        name, *box = self.run(AT % k)
+    def use(self, k: int) -> list[str]:
+        """Press an arrow key on a control, and drag its picture if it turns; return what did not change the picture."""
+        name, turns, *box = self.run(AT % k)
         QTest.qWait(SOON)
-        self.run(f"sliders[{k}].focus()")
+        self.run(f"controls[{k}].focus()")
         faults = []
-        for way, act in (("the right arrow", self.press), ("a drag", self.drag)):
+        for way, act in (("the right arrow", self.press), ("a drag", self.drag))[: 1 + turns]:
             before = self.picture(box)
             act(box)
             QTest.qWait(SOON)
@@ -132,6 +134,7 @@ class Browser:
 
     def keep(self, name: str) -> None:
         if self.pictures:
+            QTest.qWait(SOON)
             self.view.grab().save(str(self.pictures / f"{name}.png"))
 
     def run(self, script: str) -> Any:

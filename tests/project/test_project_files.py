@@ -104,6 +104,8 @@ def test_links_lead_somewhere_and_pictures_are_described() -> None:
                 right = target.startswith("https://")
             elif path.parent.name == "notebooks":
                 right = path.with_suffix(".py").is_file()
+            elif path.name == "atlas.html":  # what `make docs` grows
+                right = (ROOT / "docs" / "atlas.py").is_file()
             else:
                 right = path.exists() and (not anchor or anchor in anchors(path))
             described = not mark or (len(words) > 10 and path.stat().st_size < 2e6)
