@@ -1,6 +1,6 @@
 """Draw the house: rooms on floors, and the imports between them, measured from the code.
 
-    python docs/house.py                      # docs/house.png, of this tree
+    python docs/house.py                      # docs/house.webp, of this tree
     python docs/house.py --tree ../old -o before.png
 
 A room is a folder of `curvafit/`, or a file beside the folders. A room stands one floor above the highest room that it
@@ -28,7 +28,7 @@ HEIGHT, STOREY, LETTER, GAP = 1.0, 1.9, 0.155, 0.45
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tree", type=Path, default=ROOT, help="a checkout that holds curvafit/")
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "house.png")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "house.webp")
     options = parser.parse_args()
     package = options.tree / HOUSE
     lines, arrows = rooms(package), imports(package)
@@ -40,7 +40,7 @@ def main() -> None:
     modules = sum(1 for _ in package.rglob("*.py"))
     print(f"{modules} modules, {len(lines)} rooms, {max(floors.values()) + 1} floors, {len(arrows)} arrows,", end=" ")
     print(f"{sum(floors[a] <= floors[b] for a, b in arrows)} of them up or level, {len(circles)} circles")
-    picture(lines, arrows, floors).savefig(options.output, dpi=110)
+    picture(lines, arrows, floors).savefig(options.output, dpi=110, pil_kwargs={"lossless": True})
     print(options.output)
 
 

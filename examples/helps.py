@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from PIL import Image
+from pictures import write_webp
 from scipy.ndimage import zoom
 
-from curvafit.drawing.plot import CONTOUR, gallery_figure, write_picture
+from curvafit.drawing.plot import CONTOUR, gallery_figure
 from curvafit.generation.flow import generate
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
@@ -133,11 +133,9 @@ def main() -> None:
         for each in fillings:
             scores = {way: each.dice(each.plain(way)) for way in WAYS} | {"filled": each.dice(each.filled)}
             print(f"{name}, {each.case.name}:", ", ".join(f"{way} {score:.3f}" for way, score in scores.items()))
-        print(write_picture(picture(fillings), options.output / f"{name}.png"))
+        write_webp(picture(fillings), options.output / f"{name}.webp", lossless=True)
         if name == "helps_better":
-            path = write_picture(readme_row(fillings[0]), options.output / "filled.png")
-            Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
-            print(path)
+            write_webp(readme_row(fillings[0]), options.output / "filled.webp")
 
 
 def readme_row(filling: Filling) -> Figure:

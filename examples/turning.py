@@ -27,7 +27,7 @@ ENDS, LAWS = ("bilinear-layers", "bilinear-tubes"), 9
 #: Pictures of a turn, a picture's edge in pixels, and the quality of the strips.
 FRAMES, PIXELS, QUALITY = 24, 260, 62
 #: Shapes, pixels and colours of the README's picture, and milliseconds between its frames.
-MOVING, SMALLER, COLOURS, PAUSE = ("tubes", "sponge", "trabec"), 220, 40, 110
+MOVING, SMALLER, COLOURS, PAUSE = ("tubes", "sponge", "trabec"), 220, 24, 110
 KEPT = Path(".turning")
 
 
@@ -87,13 +87,17 @@ def write_strip(pictures: list[Image.Image], path: Path) -> None:
 
 
 def write_moving(turns: list[list[Image.Image]], path: Path) -> None:
-    """Write shapes that turn beside each other, on white, as an animation."""
+    """Write shapes that turn beside each other, on white, as an animation of one palette."""
     frames = []
     for pictures in zip(*turns, strict=True):
         sheet = Image.new("RGBA", (SMALLER * len(turns), SMALLER), "white")
         for k, picture in enumerate(pictures):
             sheet.alpha_composite(picture.resize((SMALLER, SMALLER), Image.Resampling.LANCZOS), (SMALLER * k, 0))
-        frames.append(sheet.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE))
+        frames.append(sheet.convert("RGB"))
+    pixels = np.concatenate([np.asarray(frame).reshape(-1, 3) for frame in frames])
+    palette = Image.fromarray(pixels[pixels.min(1) < 255][None]).quantize(COLOURS - 1)
+    palette.putpalette([*(palette.getpalette() or [])[: 3 * (COLOURS - 1)], 255, 255, 255])
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=PAUSE, loop=0, optimize=True)
     print(path, f"{path.stat().st_size / 1e6:.2f} MB")
 

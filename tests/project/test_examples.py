@@ -161,4 +161,8 @@ def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 def test_pictures_of_filling(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["helps", "--small", "-o", str(tmp_path)])
     script("helps").main()
-    assert {path.stem for path in tmp_path.iterdir()} == {"helps_better", "helps_equal", "helps_not", "filled"}
+    names = ("helps_better", "helps_equal", "helps_not", "filled")
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.webp" for name in names}
+    script("pictures").write_webp(tmp_path / "filled.webp", tmp_path / "small.webp", width=130)
+    with Image.open(tmp_path / "small.webp") as small, Image.open(tmp_path / "filled.webp") as large:
+        assert small.size == (130, round(130 * large.height / large.width)) and small.format == "WEBP"
