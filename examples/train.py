@@ -204,16 +204,22 @@ def load_table(path: str | Path) -> Table:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
-    """Return the table of a file's header and arrays; descriptors may be stored `scaled` to each column's range."""
+    """Return the table of a file's header and arrays; descriptors may be `steps`, scaled to each column's range."""
     shapes, views = (np.array(names, dtype=str) for names in json.loads(arrays["names"].tobytes()))
     if not np.isfinite(arrays["parameters"]).all():
         raise ValueError("parameters that are not finite")
-    scaled = "scaled" in arrays
-    descriptors = arrays["scaled"] * arrays["span"] + arrays["least"] if scaled else arrays["descriptors"]
+    scaled = "steps" in arrays
+    descriptors = _from_steps(arrays["steps"]) * arrays["span"] + arrays["least"] if scaled else arrays["descriptors"]
     if descriptors.dtype.kind != "f" or not isinstance(header["provenance"], dict):
         raise ValueError("descriptors that are no numbers, or no provenance")
     parameters, thickness, amount = (arrays[name] for name in ("parameters", "thickness", "amount"))
     return Table(shapes, views, parameters, thickness, descriptors, amount, header["provenance"])
+
+
+def _from_steps(steps: np.ndarray) -> np.ndarray:
+    """Return rows in half precision by their bits' steps from number to number, low bytes before high: so they pack."""
+    low, high = steps.astype(np.uint16)
+    return np.cumsum(low + 256 * high, dtype=np.uint16).view(np.float16).reshape(low.shape)
 
 
 def describe(

@@ -88,7 +88,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
         diagrams = atlas.diagrams(view)
         areas = np.array([d.weights.sum() for d in diagrams])
         packed = {
-            "points": np.concatenate([d.points for d in diagrams]).astype(np.float16),
+            "points": np.concatenate([d.points for d in diagrams]).astype(np.float16, order="F"),  # so it packs
             "weights": np.concatenate([d.weights / a for d, a in zip(diagrams, areas, strict=True)]).astype(np.float32),
             "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),  # diagram i has rows offsets[i:i + 2]
             "areas": areas,
