@@ -12,8 +12,8 @@ from pathlib import Path
 
 from curvafit.core.runtime import log_stages, sub_progress
 from curvafit.data_synth.atlas import build, shape_id
-from curvafit.data_synth.design import Design
-from curvafit.priors.law import PRESETS, preset
+from curvafit.data_synth.design import Design, read_point
+from curvafit.priors.law import PRESETS
 from curvafit.report.atlas import write_map
 
 STORE = Path(".cache") / "presets"
@@ -24,8 +24,7 @@ def main() -> None:
     parser.add_argument("--shape", type=int, default=40, help="voxels along an edge; 40 if not given")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/map/atlas.html"))
     options = parser.parse_args()
-    laws = [preset(name) for name in PRESETS]
-    design = Design("list", points=tuple((*law.coefficients, law.mass) for law in laws))
+    design = Design("list", points=tuple(map(read_point, PRESETS)))
     progress = log_stages()
     STORE.parent.mkdir(exist_ok=True)
     store = build(STORE, len(PRESETS), options.shape, progress=sub_progress(progress, 0.0, 0.8), design=design)

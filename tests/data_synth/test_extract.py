@@ -159,6 +159,19 @@ def small_table(rows: int = 3):
     )  # fmt: skip
 
 
+def test_descriptors_may_be_stored_as_steps(tmp_path: Path) -> None:
+    """Half precision whose bits go up and down, scaled to a range by column."""
+    path, table = tmp_path / "table.npz", small_table()
+    save_table(table, path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name != "descriptors"}
+    halves = np.random.default_rng(1).normal(size=table.descriptors.shape).astype(np.float16)
+    steps = np.diff(halves.view(np.uint16).ravel(), prepend=np.uint16(0)).reshape(halves.shape)
+    span, least = np.linspace(1, 2, halves.shape[1], dtype=np.float32), np.float32(-3)
+    np.savez(path, steps=np.stack([steps & 255, steps >> 8]).astype(np.uint8), span=span, least=least, **arrays)
+    assert np.array_equal(load_table(path).descriptors, halves * span + least)
+
+
 def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "table.npz"
     with pytest.raises(FileNotFoundError, match="table"):
