@@ -28,7 +28,7 @@ from curvafit.generation.result import is_well_formed
 from curvafit.inference.emulator import Emulator
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import law_of as coefficients_of
-from examples.train import load_table, measure_view
+from examples.train import decorrelate, load_table, measure_view
 
 SEED, EDGE, SHAPES, VIEW = 70, 64, 4, "mask"
 STEPS = (0.05, 0.1, 0.2)
@@ -39,7 +39,7 @@ def spread_of_seeds(emulator: Emulator) -> np.ndarray:
     """Return the deviation `(k,)` between shapes of one law in each uncorrelated direction, from the table."""
     table = load_table(RESULTS / "table.npz").visible.select_views([VIEW])
     _, law, count = np.unique(table.parameters, axis=0, return_inverse=True, return_counts=True)
-    rows, law = emulator.decorrelate(table.descriptors), law.ravel()
+    rows, law = decorrelate(emulator, table.descriptors), law.ravel()
     means = np.stack([np.bincount(law, column) / count for column in rows.T], axis=1)
     return np.sqrt(np.square(rows - means[law]).sum(0) / (count - 1).sum())
 
@@ -75,7 +75,7 @@ def pair(name: str, length: float, cases: Cases) -> Values:
     emulator = load_posterior().emulator
     spread = spread_of_seeds(emulator)
     first, second = (
-        emulator.decorrelate(cases.array(f"{name}-{step}", partial(grow, name, step))) / spread for step in (0, length)
+        decorrelate(emulator, cases.array(f"{name}-{step}", partial(grow, name, step))) / spread for step in (0, length)
     )
     if min(len(first), len(second)) < SHAPES:
         return {"grown": [len(first), len(second)]}

@@ -41,7 +41,7 @@ from curvafit.data_synth.atlas import open_all, versions
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.result import is_well_formed
 from curvafit.geometry.description import BLOCKS, LEVELS
-from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
+from curvafit.inference.emulator import FAINTEST, Emulator, Layer, forward, misfits
 from curvafit.inference.posterior import (
     MASS,
     MOST,
@@ -52,6 +52,7 @@ from curvafit.inference.posterior import (
     Posterior,
     save_posterior,
 )
+from curvafit.inference.stationary import call_in_double
 from curvafit.inference.table import LEAST, PARAMETERS, TARGETS, Compression, column_names, columns_of, parameters_of
 from curvafit.scan.measures import Reading, read_texture
 from curvafit.scan.preparation import prepare, thinner_thickness
@@ -555,13 +556,34 @@ def _inflation(emulator: Emulator, table: Table, residuals: np.ndarray) -> float
     squared, expected = 0.0, 0.0
     for view in emulator.views:
         in_view = table.views == view
-        slopes = emulator.slopes(table.parameters[in_view], table.views[in_view], table.amount[in_view])
+        slopes = find_slopes(emulator, table.parameters[in_view], table.views[in_view], table.amount[in_view])
         gradients = np.einsum("nkd,nk->nd", slopes, residuals[in_view])
         information = np.einsum("nkd,nke->nde", slopes, slopes)
         covariance = np.linalg.inv(information + np.eye(len(PARAMETERS)))
         squared += np.einsum("nd,nde,ne->", gradients, covariance, gradients)
         expected += np.einsum("nde,ned->", covariance, information)
     return float(squared / expected)
+
+
+def find_slopes(emulator: Emulator, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
+    """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
+
+    def differentiate() -> Callable[..., Any]:
+        import jax
+
+        def mean(layers, inputs):
+            return forward(layers, inputs[None])[:, 0].mean(0)
+
+        return jax.jit(jax.vmap(jax.jacfwd(mean, 1), (None, 0)))
+
+    inputs = emulator.inputs(parameters, views, amount)
+    slopes = call_in_double(differentiate, emulator.mean, inputs)[..., : len(PARAMETERS)]
+    return (emulator.basis @ slopes) / emulator(parameters, views, amount).deviation[..., None]
+
+
+def decorrelate(emulator: Emulator, descriptors: np.ndarray) -> np.ndarray:
+    """Return descriptors `(N, 351)` along the rows of an emulator's basis, `(N, k)`: seeds differ independently."""
+    return emulator.compression(descriptors) @ emulator.basis.T
 
 
 def _normal_nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:

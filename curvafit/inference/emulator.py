@@ -94,16 +94,6 @@ class Emulator:
         """Return parameters in deviations of the prior."""
         return (parameters - self.centre) / self.deviation
 
-    def decorrelate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return descriptors `(N, 351)` along the rows of the basis `(N, k)`."""
-        return self.compression(descriptors) @ self.basis.T
-
-    def slopes(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
-        """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
-        inputs = self.inputs(parameters, views, amount)
-        slopes = call_in_double(_jacobian, self.mean, inputs)[..., : len(PARAMETERS)]
-        return (self.basis @ slopes) / self(parameters, views, amount).deviation[..., None]
-
 
 def best_parameters(emulator: Emulator, reading: Reading, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters `(6,)` of greatest posterior density given a reading, and their covariance.
@@ -162,17 +152,6 @@ def _minimise(
     rows = (target, deviation, seen, logits)
     logits, slopes, unexplained, values = call_in_double(_minimiser, emulator.mean, emulator.basis, *rows)
     return low + (high - low) / (1 + np.exp(-logits)), slopes, unexplained, values
-
-
-@functools.cache
-def _jacobian() -> Callable[..., Any]:
-    """Return the derivative of the networks' mean by their inputs, for many rows of inputs."""
-    import jax
-
-    def mean(layers, inputs):
-        return forward(layers, inputs[None])[:, 0].mean(0)
-
-    return jax.jit(jax.vmap(jax.jacfwd(mean, 1), (None, 0)))
 
 
 @functools.cache

@@ -54,7 +54,7 @@ def test_slopes_are_exact() -> None:
     assert emulator(at, *seen(at)[1:]).mean == pytest.approx(told(at))
     for k in range(6):
         ends = [emulator(at + sign * step * np.eye(6)[k], *seen(at)[1:]).mean for sign in (-1, 1)]
-        slope = emulator.slopes(at, *seen(at)[1:])[..., k]
+        slope = training.find_slopes(emulator, at, *seen(at)[1:])[..., k]
         assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4 / NOISE, abs=1e-4)
 
 
