@@ -33,12 +33,12 @@ from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.candidates import Misfit, join_tests
 from curvafit.inference.estimate import estimate_law, measure_descriptors, tail_probability
-from curvafit.inference.posterior import Discriminant, Posterior, load_posterior, save_posterior
+from curvafit.inference.posterior import Discriminant, Posterior, load_posterior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.preparation import prepare
 from curvafit.volumes.volume import ScanError, Volume
 from examples.mixed import KINDS
-from examples.train import Scanned, Table, keep_laws, measure_view, see_mask, see_scan
+from examples.train import Scanned, Table, keep_laws, measure_view, save_posterior, see_mask, see_scan
 
 SEED, TEXTURES = 7, RESULTS / "textures.npz"
 

@@ -50,7 +50,6 @@ from curvafit.inference.posterior import (
     Combinations,
     Member,
     Posterior,
-    save_posterior,
 )
 from curvafit.inference.stationary import call_in_double
 from curvafit.inference.table import LEAST, PARAMETERS, TARGETS, Compression, column_names, columns_of, parameters_of
@@ -540,6 +539,31 @@ def train_emulator(
     columns = (references.descriptors, references.views, references.amount)
     unexplained = misfits(emulator, *columns, references.parameters[:, None])
     return emulator, {view: np.sort(unexplained[references.views == view]) for view in views}
+
+
+def save_posterior(posterior: Posterior, path: str | Path) -> None:
+    """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
+    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread")}
+    arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
+    for k, member in enumerate(posterior.members):
+        arrays |= {f"{k}.{name}": value.numpy() for name, value in member.state_dict().items()}
+    for name, layers in (("mean", posterior.emulator.mean), ("spread", posterior.emulator.spread)):
+        for k, layer in enumerate(layers):
+            arrays |= {f"emulator.{name}.{k}.{field}": value for field, value in layer._asdict().items()}
+    arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
+    arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
+    for view, fisher in posterior.discriminants.items():
+        arrays |= {f"{name}.{view}": values.astype(np.float32) for name, values in fisher._asdict().items()}
+    arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
+    header = {
+        "architecture": dataclasses.asdict(posterior.architecture),
+        "members": len(posterior.members),
+        "inflation": posterior.emulator.inflation,
+        "views": posterior.views,
+        "ends": posterior.combinations.ends,
+        "provenance": posterior.provenance,
+    }
+    POSTERIOR_FILE.write(path, header, arrays)
 
 
 def keep_laws(table: Table, seed: int) -> np.ndarray:

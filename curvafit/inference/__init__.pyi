@@ -11,5 +11,4 @@ from .inference import Inference as Inference
 from .inference import infer as infer
 from .posterior import Posterior as Posterior
 from .posterior import load_posterior as load_posterior
-from .posterior import save_posterior as save_posterior
 from .stationary import stationarity as stationarity

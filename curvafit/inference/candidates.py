@@ -147,8 +147,8 @@ def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
 class Twin:
     """A shape grown from a law, or the reason why none grew.
 
-    `phase` and `mass` are the shape's own. `seen` is the shape as the scan would show it, with its blur and noise;
-    `diagram` and `morphometry` are measured of that.
+    `phase` and `mass` are the shape's own; `diagram` and `morphometry` are measured of it as the scan would show it,
+    with its blur and noise.
     """
 
     phase: np.ndarray | None
@@ -156,7 +156,6 @@ class Twin:
     diagram: Diagram | None
     morphometry: Morphometry | None
     reason: str = ""
-    seen: Prepared | None = None
 
 
 def twin(law: Candidate, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED) -> Twin:
@@ -188,7 +187,7 @@ def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
     except ValueError as error:
         return Twin(None, flow.mass, None, None, str(error))
     figures = morphometry(seen.mask, seen.working_voxel, seen.unit, periodic=seen.grid.periodic)
-    return Twin(field, flow.mass, curvature, figures, seen=seen)
+    return Twin(field, flow.mass, curvature, figures)
 
 
 @dataclass(frozen=True)

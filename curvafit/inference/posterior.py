@@ -6,7 +6,7 @@ shapes.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -241,31 +241,6 @@ class Combinations:
             known = float(np.clip(1 - sums.var(), 0, 1))  # a sum's variance among laws is 1
             combinations.append(Combination(low, high, by_name, median, (least, most), known))
         return tuple(sorted(combinations, key=lambda combination: -combination.known))
-
-
-def save_posterior(posterior: Posterior, path: str | Path) -> None:
-    """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
-    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread")}
-    arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
-    for k, member in enumerate(posterior.members):
-        arrays |= {f"{k}.{name}": value.numpy() for name, value in member.state_dict().items()}
-    for name, layers in (("mean", posterior.emulator.mean), ("spread", posterior.emulator.spread)):
-        for k, layer in enumerate(layers):
-            arrays |= {f"emulator.{name}.{k}.{field}": value for field, value in layer._asdict().items()}
-    arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
-    arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
-    for view, fisher in posterior.discriminants.items():
-        arrays |= {f"{name}.{view}": values.astype(np.float32) for name, values in fisher._asdict().items()}
-    arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
-    header = {
-        "architecture": asdict(posterior.architecture),
-        "members": len(posterior.members),
-        "inflation": posterior.emulator.inflation,
-        "views": posterior.views,
-        "ends": posterior.combinations.ends,
-        "provenance": posterior.provenance,
-    }
-    POSTERIOR_FILE.write(path, header, arrays)
 
 
 def load_posterior(path: str | Path | None = None) -> Posterior:

@@ -10,12 +10,12 @@ from scripts import example, refused, run
 
 import curvafit.inference.table as room
 from curvafit.geometry.description import BLOCKS
-from curvafit.inference.posterior import Architecture, Discriminant, Posterior, load_posterior, save_posterior
+from curvafit.inference.posterior import Architecture, Discriminant, Posterior, load_posterior
 from curvafit.inference.table import columns_of, mirror_parameters
 from curvafit.scan.measures import Reading
 
 training = example("train")
-PLANS, train_posterior = training.PLANS, training.train_posterior
+PLANS, train_posterior, save_posterior = training.PLANS, training.train_posterior, training.save_posterior
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
 NOISE = 0.2
 ONCE = (PLANS[0]._replace(epochs=1), PLANS[1]._replace(epochs=1))
