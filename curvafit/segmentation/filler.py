@@ -353,9 +353,6 @@ class Raster:
         axes = zip(self.core, self.scale, self._pixels, strict=True)
         # The position of the core's first voxel, in pixels from the first one of `values`.
         first = [core.start * pixels_per_voxel - window.start for core, pixels_per_voxel, window in axes]
-        if self.scale == (1.0, 1.0):
-            y, x = map(int, first)
-            return values[:, y : y + shape[0], x : x + shape[1]]
         return np.stack([_sample(plane, shape, self.scale, first) for plane in values])
 
     @property
@@ -392,15 +389,15 @@ class Raster:
         shape = [m + 2 * REACH for m in self.size]
         axes = zip(self._pixels, self.scale, self._window, strict=True)
         start = [(edge.start - REACH) / h - window.start for edge, h, window in axes]
-        if self.scale == (1.0, 1.0):
-            y, x = map(int, start)
-            return plane[y : y + shape[0], x : x + shape[1]]
         return _sample(plane, shape, [1 / h for h in self.scale], start)
 
 
 def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], start: Sequence[float]) -> np.ndarray:
     """Interpolate a plane linearly at the centres of pixels `step` wide, the first of which has its corner at `start`,
     both in the plane's own pixels."""
+    if tuple(step) == (1.0, 1.0):
+        y, x = map(int, start)
+        return plane[y : y + shape[0], x : x + shape[1]]
     offset = [a + 0.5 * h - 0.5 for a, h in zip(start, step, strict=True)]
     return ndimage.affine_transform(plane, np.diag(step), offset, shape, np.float32, order=1, mode="nearest")  # type: ignore[arg-type]
 

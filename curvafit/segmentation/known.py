@@ -13,7 +13,7 @@ from curvafit.priors.grid import MOST
 from curvafit.segmentation.slices import IDS, LABELS, Slices, axis_first, require_labels
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.run import Record, Run
-from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, cut_boxes, round_labels
 
 #: Slices of a file that are read at once, and their bytes at most.
 THICK, SLAB = CHUNK, 2**26
@@ -90,21 +90,13 @@ class Known:
         return edges[0], edges[1], edges[2]
 
     @property
-    def _slabs(self) -> list[slice]:
-        """The ranges of slices that are read at once: of a volume in memory all."""
-        length, *plane = axis_first(self.volume.shape, self.axis)
+    def _slabs(self) -> list[Box]:
+        """The boxes of slices that are read at once: of a volume in memory all."""
+        shape = length, *plane = axis_first(self.volume.shape, self.axis)
         thickness = length
         if self.volume.in_file:
             thickness = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.array.file.dtype.itemsize)))
-        return [slice(start, min(start + thickness, length)) for start in range(0, length, thickness)]
-
-    def _read(self, rows: slice) -> np.ndarray:
-        """Return the values (n, Y, X) of a range of slices."""
-        _, *plane = axis_first(self.volume.shape, self.axis)
-        values = self.volume.read(self.turn_box((rows, slice(0, plane[0]), slice(0, plane[1]))))
-        if self.volume.in_file:
-            check_finite(values, self.volume.source)
-        return self.turn(round_labels(values))
+        return cut_boxes(shape, (thickness, *plane))
 
     def _find_labelled(self, run: Run) -> np.ndarray:
         """Return whether each slice has labels, bool (length,)."""
@@ -122,8 +114,11 @@ class Known:
 def _read_slab(known: Known, name: str, number: int) -> Record:
     """Return the record of a slab: whether each slice has labels (`there`), which of the known slices it holds
     (`which`), their masks (`inside`), and the different labels in them (`values`)."""
-    slab = known._slabs[number]
-    values = known._read(slab)
+    volume, box = known.volume, known._slabs[number]
+    slab, values = box[0], volume.read(known.turn_box(box))
+    if volume.in_file:
+        check_finite(values, volume.source)
+    values = known.turn(round_labels(values))
     labelled = (values > 0).any((1, 2))
     rows = np.array([k for k, place in enumerate(known.places) if slab.start <= place < slab.stop], dtype=np.intp)
     if not len(rows):

@@ -19,12 +19,12 @@ from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, list_numbers
 from curvafit.segmentation.reconstruction import UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
-from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, require_labels
+from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, mark_between, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Run
-from curvafit.volumes.volume import Box, ScanError, Volume, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, grow, round_labels
 
 #: Defaults of the options that say which slices are known.
 WHICH: dict[str, Any] = {"every": None, "known": None, "ignore": None, "axis": 0}
@@ -289,9 +289,7 @@ def _split_instances(
     indices = split_structure(whole.mask.values, indices, inputs.known_voxels, known.volume.spacing)
     inside = whole.probability.values
     likely, dice = np.where(indices, inside, 1 - inside), []
-    between = np.zeros(indices.shape[known.axis], dtype=bool)
-    between[known.places[0] : known.places[-1]] = True
-    between[list(known.places)] = False
+    between = mark_between(known.places, indices.shape[known.axis])
     for index, (box, part) in enumerate(parts, 1):
         probabilities, mask = inside[box] * _odds(part) / np.maximum(odds[box], SURE), indices[box] == index
         likely[box] = np.where(mask, probabilities, likely[box])
@@ -306,16 +304,11 @@ def _box_of_label(inside: np.ndarray, inputs: _Inputs) -> Box:
     them to the next known slice beyond; within slices `ROOM` voxels and two gaps more on each side."""
     places, axis, spacing = inputs.known.places, inputs.known.axis, inputs.known.volume.spacing
     two_gaps = 2 * max(np.diff(places)) * spacing[axis]
-    box: list[slice] = []
-    for k in range(3):
-        positions = np.flatnonzero(inside.any(tuple({0, 1, 2} - {k})))
-        low, high = int(positions[0]), int(positions[-1])
-        if k == axis:
-            before, beyond = [place for place in places if place < low], [place for place in places if place > high]
-            box.append(slice(before[-1] if before else 0, beyond[0] + 1 if beyond else inside.shape[k]))
-        else:
-            margin = ROOM + math.ceil(two_gaps / spacing[k])
-            box.append(slice(max(low - margin, 0), min(high + 1 + margin, inside.shape[k])))
+    bounds = ndimage.find_objects(inside.view(np.uint8))[0]
+    box = list(grow(bounds, [ROOM + math.ceil(two_gaps / h) for h in spacing], inside.shape))
+    before = [place for place in places if place < bounds[axis].start]
+    beyond = [place for place in places if place >= bounds[axis].stop]
+    box[axis] = slice(before[-1] if before else 0, beyond[0] + 1 if beyond else inside.shape[axis])
     return box[0], box[1], box[2]
 
 

@@ -110,10 +110,7 @@ class Slices:
     @property
     def between(self) -> np.ndarray:
         """Whether each slice of the volume lies between two known ones, bool (length,)."""
-        between = np.zeros(self.length, dtype=bool)
-        between[self.places[0] : self.places[-1]] = True
-        between[list(self.places)] = False
-        return between
+        return mark_between(self.places, self.length)
 
 
 def axis_first(values: Sequence[Any], axis: int) -> tuple[Any, Any, Any]:
@@ -136,6 +133,14 @@ def filled_range(places: Sequence[int], length: int) -> slice:
     """Return the slices that are filled: those between known ones, and half the nearest gap beyond each end."""
     before, beyond = (places[1] - places[0]) // 2, (places[-1] - places[-2]) // 2
     return slice(max(places[0] - before, 0), min(places[-1] + beyond + 1, length))
+
+
+def mark_between(places: Sequence[int], length: int) -> np.ndarray:
+    """Return whether each slice lies between two known ones, bool (length,)."""
+    between = np.zeros(length, dtype=bool)
+    between[places[0] : places[-1]] = True
+    between[list(places)] = False
+    return between
 
 
 def harmonic_distance(places: Sequence[int], length: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from curvafit.generation.problem import Data
 from curvafit.segmentation.flow import WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.run import Record, open_run
-from curvafit.volumes.volume import Box, within
+from curvafit.volumes.volume import Box, grow, within
 
 #: Working voxels beyond a tile that are lowered with it: the cut at this distance does not change the tile.
 OVERLAP = 24
@@ -46,16 +46,9 @@ def cut_tiles(grid: WorkingGrid, shape: Sequence[int], edge: int | None = None) 
 def surround(tile: Box, grid: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
     """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of `shape` voxels of
     `grid.times` working voxels each. The box is the tile with its overlap."""
-    if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
-        return tile, grid
-    box, ends = [], []
-    for edge, n, times in zip(tile, shape, grid.times, strict=True):
-        overlap = -(-OVERLAP // times)  # in voxels, rounded up
-        start, stop = edge.start - overlap, edge.stop + overlap
-        box.append(slice(max(start, 0), min(stop, n)))
-        ends.append((start <= 0, stop >= n))
-    z, y, x = box
-    return (z, y, x), grid.of_box([edge.stop - edge.start for edge in box], tuple(ends))
+    box = grow(tile, [-(-OVERLAP // times) for times in grid.times], shape)  # in voxels, rounded up
+    z, y, x = ((edge.start == 0, edge.stop == n) for edge, n in zip(box, shape, strict=True))
+    return box, grid.of_box([edge.stop - edge.start for edge in box], (z, y, x))
 
 
 @dataclass(frozen=True, eq=False)
