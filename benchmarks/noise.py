@@ -23,7 +23,7 @@ from skimage.segmentation import random_walker
 from benchmarks.completion import EDGE, LAWS, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, best, bootstrap, scores, show
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.evidence import estimate_classes, grey_evidence, grey_levels
+from curvafit.segmentation.evidence import estimate_classes, grey_bounds, grey_evidence
 from curvafit.segmentation.segmentation import segment
 from curvafit.volumes.volume import Volume
 
@@ -75,7 +75,7 @@ def grey_case(way: str, law: str, seed: int, noise: float, cases: Cases) -> Valu
     values = (truth + noise * np.random.default_rng(seed).standard_normal(truth.shape)).astype(np.float32)
     scan = Volume(values, (1.0, 1.0, 1.0))
     if way == "start":
-        levels = grey_levels(scan)
+        levels = values.clip(*grey_bounds(values))
         mask = grey_evidence(levels, scan, estimate_classes(levels, scan)).level > 0
     elif way in RIVALS:
         mask = rival(way, "grey", values, truth)

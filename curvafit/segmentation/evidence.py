@@ -102,8 +102,9 @@ class GreyEvidence:
         threshold of noisy levels leaves some of each phase on either side, which brings the two means together: at
         `DEEP` voxels from the first guess of the surface few voxels are on the wrong side."""
         sample, _ = subsample(volume)
-        levels = grey_levels(sample, threshold)
-        bounds = grey_bounds(sample.values.astype(np.float32), threshold)
+        levels = sample.values.astype(np.float32)
+        bounds = grey_bounds(levels, threshold)
+        levels = levels.clip(*bounds)
         first = classes = estimate_classes(levels, sample, threshold, dark)
         if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
             inside = grey_evidence(levels, sample, classes).level > 0
@@ -128,12 +129,6 @@ class GreyEvidence:
 
 #: The evidence of a volume, in memory or computed box by box.
 VolumeEvidence = VoxelEvidence | GreyEvidence
-
-
-def grey_levels(scan: Volume, threshold: float | str = "otsu") -> np.ndarray:
-    """Return a scan's grey levels as float32, clipped to `grey_bounds`."""
-    values = scan.values.astype(np.float32)
-    return values.clip(*grey_bounds(values, threshold))
 
 
 def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:

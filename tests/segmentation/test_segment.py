@@ -45,7 +45,8 @@ def noisy(mask: np.ndarray, noise: float, **place) -> Volume:
 
 
 def of_intensities(scan: Volume, threshold: float | str = "otsu", dark: bool = False) -> room.VoxelEvidence:
-    values = room.grey_levels(scan, threshold)
+    values = scan.values.astype(np.float32)
+    values = values.clip(*room.grey_bounds(values, threshold))
     return room.grey_evidence(values, scan, room.estimate_classes(values, scan, threshold, dark))
 
 
