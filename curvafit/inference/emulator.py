@@ -76,23 +76,14 @@ class Emulator:
 
     def inputs(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
         """Return the networks' inputs `(N, …)`: the parameters in deviations of the prior, the amount, and the view."""
-        scaled = self.standardise(np.atleast_2d(parameters))
+        scaled = (np.atleast_2d(parameters) - self.box.mean(1)) / self.deviation
         conditions = encode_seen(self.views, views, amount)
         return np.concatenate([scaled, np.broadcast_to(conditions, (len(scaled), conditions.shape[1]))], 1)
-
-    @property
-    def centre(self) -> np.ndarray:
-        """Return the means `(6,)` of parameters uniform in the box."""
-        return self.box.mean(1)
 
     @property
     def deviation(self) -> np.ndarray:
         """Return the deviations `(6,)` of parameters uniform in the box."""
         return (self.box[:, 1] - self.box[:, 0]) / np.sqrt(12)
-
-    def standardise(self, parameters: np.ndarray) -> np.ndarray:
-        """Return parameters in deviations of the prior."""
-        return (parameters - self.centre) / self.deviation
 
 
 def best_parameters(emulator: Emulator, reading: Reading, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
