@@ -73,12 +73,6 @@ class Format:
         What to do about a file of another version, for messages: `"extract it again from its store"`.
     fixed
         Further entries of the header that must be as they are here, such as settings that all content depends on.
-
-    Examples
-    --------
-    >>> atlas = Format("curvafit atlas", 1, "an atlas file", remedy="extract it again from its store")
-    >>> atlas.write("atlas.npz", {"unit": "mm"}, {"points": points})
-    >>> header, arrays = atlas.read("atlas.npz")
     """
 
     name: str

@@ -177,29 +177,23 @@ class FileArray:
         return f"{self.path.resolve()} {self.reading}: {size} bytes at {time}"
 
 
-def read_file(
-    path: Path | str,
-    key: str | None = None,
-    raw_shape: Sequence[int] | None = None,
-    dtype: str | None = None,
-    **sampling: Any,
-) -> Stated:
+def read_file(path: Path | str, key: str | None = None, **options: Any) -> Stated:
     """Return what a file, a folder, or a store at a URL states; errors of the reading library become a ScanError.
 
-    `sampling` are the caller's spacing and unit, at which a mesh is made a volume.
+    Of the `options` of `load`, a RAW file takes raw_shape and dtype, and a mesh the spacing and unit of its voxels.
     """
     if isinstance(path, str):
         with _name_damage(path):
             return zarr.read_remote(path, key)
     if not path.exists():
         raise FileNotFoundError(one_line(f"no such file: {path}"))
-    reader = pick_reader(base.check_regular(path), raw_shape is not None)
+    reader = pick_reader(base.check_regular(path), options.get("raw_shape") is not None)
     if key is not None and reader not in KEYED:
         raise ScanError(
             f"a key applies to NPZ, HDF5, Imaris, Zarr, DICOM, CZI, LIF and ND2 only, got {quoted(key)} for {path}"
         )
     with _name_damage(path):
-        return reader(path, key=key, raw_shape=raw_shape, dtype=dtype, **sampling)
+        return reader(path, key=key, **options)
 
 
 @contextmanager
@@ -446,10 +440,10 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
         Voxels of every map (z, y, x); by default the shape of the first map.
     """
     source = Path(path)
-    if not source.exists():
-        raise FileNotFoundError(f"no such file of maps: {source}")
     try:
         content = read_archive(source)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no such file of maps: {source}") from None
     except (ValueError, OSError) as reason:
         raise ValueError(f"{source} is not an NPZ file of maps") from reason
     unknown = sorted(content.keys() - set(PARAMETERS))

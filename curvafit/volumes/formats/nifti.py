@@ -104,11 +104,9 @@ def write_nifti(field: Any, path: Path) -> None:
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
     if values.dtype == np.float16:
         values = values.astype(np.float32)
-    unit, factor = _TO_FILE[field.unit]
     affine = affine_in_file(field)
     image = nibabel.Nifti1Image(values.T, affine, dtype=values.dtype)
-    image.header.set_xyzt_units(unit)
-    image.header.set_zooms([h * factor for h in field.spacing[::-1]])
+    image.header.set_xyzt_units(_TO_FILE[field.unit][0])
     image.set_qform(affine, code="aligned")
     image.set_sform(affine, code="aligned")
     if field.unit in ("voxel", "nm"):
