@@ -145,15 +145,6 @@ def infer(
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
     structure = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
     volume, shape, prepared = _read_and_prepare(scan, structure, reading)
-    settings = {"refined": REFINED[method], "growth": growth, "seed": seed, "progress": progress}
-    return _infer_prepared(volume, shape, prepared, atlas, posterior, **settings)
-
-
-def _infer_prepared(
-    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, atlas: Atlas, posterior: Posterior, *,
-    refined: bool, growth: Growth | None, seed: int, progress: Progress,
-) -> Inference:  # fmt: skip
-    """Measure a prepared scan, estimate its law, grow and compare shapes, judge, and return all in one result."""
     progress("measuring curvature", 0.05)
     diagram = None if prepared.noise else scan_diagram(prepared)
     figures = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
@@ -161,7 +152,8 @@ def _infer_prepared(
     estimate, chosen = Estimate(), None
     twins: dict[str, tuple[Twin, ...]] = {}
     if diagram is not None and not status:
-        estimate = _estimate(prepared, diagram, atlas, posterior, refined=refined, seed=seed, progress=progress)
+        options = {"refined": REFINED[method], "seed": seed, "progress": progress}
+        estimate = _estimate(prepared, diagram, atlas, posterior, **options)
         if growth is not None:
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
         chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=growth is not None)
@@ -214,12 +206,12 @@ def _grow(
     twins: dict[str, tuple[Twin, ...]] = dict.fromkeys(laws, ())
     stage = sub_progress(progress, 0.6, 1.0)
 
-    def grow(wanted: list[tuple[str, int]]) -> None:
-        shapes = map_threads(lambda one: twin(laws[one[0]], prepared, seed + one[1], growth.schedule), wanted)
-        for (name, _), shape in zip(wanted, shapes, strict=True):
+    def grow(numbered: list[tuple[str, int]]) -> None:
+        shapes = map_threads(lambda one: twin(laws[one[0]], prepared, seed + one[1], growth.schedule), numbered)
+        for (name, _), shape in zip(numbered, shapes, strict=True):
             twins[name] = (*twins[name], shape)
             stage(f"grown: {TITLES[name]}, shape {len(twins[name])}", min(1.0, sum(map(len, twins.values())) / total))
-        laws.update({name: laws[name].compare(diagram, twins[name]) for name in {name for name, _ in wanted}})
+        laws.update({name: laws[name].compare(diagram, twins[name]) for name in {name for name, _ in numbered}})
 
     total = max(1, len(laws) + growth.twins - 1)
     grow([(name, 0) for name in laws])

@@ -34,8 +34,8 @@ class Known:
 
     @classmethod
     def find(
-        cls, volume: Volume, run: Run, *, every: int | slice | None, known: Sequence[int] | None, ignore: int | None,
-        axis: int,
+        cls, volume: Volume, run: Run, *, every: int | slice | None = None, known: Sequence[int] | None = None,
+        ignore: int | None = None, axis: int = 0,
     ) -> Known:  # fmt: skip
         """Find which slices of a volume are known by the options of `reconstruct`; `ignore` needs it in memory."""
         whole = cls(volume, axis)
@@ -128,8 +128,8 @@ def _read_slab(known: Known, name: str, number: int) -> Record:
 
 
 def check_which(
-    shape: Sequence[int], every: int | slice | None, known: Sequence[int] | None, ignore: int | None, axis: int,
-    suggest: int,
+    shape: Sequence[int], every: int | slice | None = None, known: Sequence[int] | None = None,
+    ignore: int | None = None, axis: int = 0, *, suggest: int,
 ) -> None:  # fmt: skip
     """Raise ValueError where options of `reconstruct` do not fit the volume's shape, or each other."""
     length = shape[check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)]

@@ -26,8 +26,6 @@ from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Run
 from curvafit.volumes.volume import Box, ScanError, Volume, grow, round_labels
 
-#: Defaults of the options that say which slices are known.
-WHICH: dict[str, Any] = {"every": None, "known": None, "ignore": None, "axis": 0}
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
 #: Labels that are described one by one.
@@ -118,13 +116,13 @@ class _Inputs:
         working: Working, reading: dict[str, Any], suggest: int = 0, **which: Any,
     ) -> _Inputs:  # fmt: skip
         """Read labels, image and example, and find which slices and which labels are known."""
-        which, volume = {**WHICH, **which}, load(slices, **reading)
+        volume = load(slices, **reading)
         check_which(volume.shape, **which, suggest=suggest)
         volume = replace(volume, array=round_labels(volume.values))
-        known, ignore = Known.find(volume, Run(), **which), which["ignore"]
+        known, ignore = Known.find(volume, Run(), **which), which.get("ignore")
         places, values = list(known.places), known.turn(volume.values)
         labels = find_labels(values[places], chosen)
-        if which["every"] is None and which["known"] is None and ignore is None:
+        if all(which.get(name) is None for name in ("every", "known", "ignore")):
             check_shared(values, places, labels)
         indices = index_labels(volume.values, labels, ignore)
         known_voxels = np.zeros(values.shape, dtype=bool) if known.marks is None else known.marks != 0

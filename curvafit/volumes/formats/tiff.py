@@ -28,10 +28,8 @@ _RESOLUTION_LIMIT = 2**31
 #: Words of tifffile's messages where it skips a part of a file.
 _LOST = re.compile("invalid (page )?offset|missing|corrupted|not match|failed to|out of range|raised", re.IGNORECASE)
 _TAG_UNITS = {2: "inch", 3: "cm"}
-#: Steps along (z, y, x) and their units, where the file states them, and notes on what is assumed.
-_Spacing = tuple[Sequence[float] | None, Sequence[str | None], tuple[str, ...]]
-#: Nothing is stated.
-_UNKNOWN: _Spacing = (None, (None,) * 3, ())
+#: Steps along (z, y, x), their units, and guesses, as fields of `Stated`; empty where nothing is stated.
+_Spacing = dict[str, Any]
 #: Resolutions that programs write when they know none (dots per inch; 25.4 is one dot per millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 #: Suffixes of slices.
@@ -50,7 +48,7 @@ def read_tiff(path: Path, **_: object) -> Stated:
         series = file.series[0]
         base.check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
-        steps, units, guesses = _read_spacing(file)
+        spacing = _read_spacing(file)
         axes = base.name_axes(series.axes)
         values, calibration_notes = _calibrate(np.asarray(series.asarray()), file.imagej_metadata or {})
         count, nodata = len(file.series), series.pages[0].tags.get(42113)  # type: ignore[union-attr]
@@ -63,7 +61,7 @@ def read_tiff(path: Path, **_: object) -> Stated:
         notes += (f"By the file, {nodata.value} stands where nothing was measured.",)
     if tag_errors:
         notes += (f"{len(tag_errors)} of the file's tags cannot be read: what they state is not known.",)
-    return Stated(values, axes, steps, units, notes=(*notes, *calibration_notes), guesses=guesses)
+    return Stated(values, axes, notes=(*notes, *calibration_notes), **spacing)
 
 
 def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -144,14 +142,14 @@ def _to_tiff(values: np.ndarray) -> np.ndarray:
 
 
 def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
-    """Return steps, units and notes on what is assumed, from the description or, without one, the resolution tags."""
+    """Return steps, units and guesses, from the description or, without one, the resolution tags."""
     if file.is_ome and file.ome_metadata:
         nodes = ElementTree.fromstring(file.ome_metadata).iter()
         return _from_sizes(next((node.attrib for node in nodes if node.tag.endswith("Pixels")), {}))
     description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
     if "curvafit_spacing" in description:
         steps = [float(h) for h in description["curvafit_spacing"].split(",")]
-        return steps, (description["curvafit_unit"],) * 3, ()
+        return {"steps": steps, "units": (description["curvafit_unit"],) * 3}
     if "PhysicalSizeX" in description:
         return _from_sizes(description)
     if file.is_imagej:
@@ -161,47 +159,47 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
     # tifffile's JSON has three numbers, or one for all axes
     sizes, unit = [float(h) for h in np.atleast_1d(description["spacing"])], description.get("unit")
     if len(sizes) == 3:
-        return sizes, (unit,) * 3, ()
+        return {"steps": sizes, "units": (unit,) * 3}
     note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
-    return sizes[:1] * 3, (unit,) * 3, (note,)
+    return {"steps": sizes[:1] * 3, "units": (unit,) * 3, "guesses": (note,)}
 
 
 def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
-    """Return steps, units and notes from OME's sizes, where 0 is unknown; an axis without a size gets that of x."""
+    """Return steps, units and guesses from OME's sizes, where 0 is unknown; an axis without a size gets that of x."""
     sizes = {axis: float(pixels.get(f"PhysicalSize{axis}", 0)) for axis in "ZYX"}
     if not sizes["X"]:
-        return _UNKNOWN
+        return {}
     axes = [axis if sizes[axis] else "X" for axis in "ZYX"]
     units = [pixels.get("unit", pixels.get(f"PhysicalSize{axis}Unit", "um")) for axis in axes]
     guesses = (base.NO_DISTANCE,) if not sizes["Z"] and int(pixels.get("SizeZ", 1)) > 1 else ()
     if "reference frame" in units:
         guesses += ("The file states sizes in a reference frame, not in a unit of length: they are taken for voxels.",)
-    return [sizes[axis] for axis in axes], units, guesses
+    return {"steps": [sizes[axis] for axis in axes], "units": units, "guesses": guesses}
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
-    """Return steps, units and a note from ImageJ's description (the distance of slices) and the resolution tags."""
+    """Return steps, units and a guess from ImageJ's description (the distance of slices) and the resolution tags."""
     y, x = _pixels_per_unit(file)
     z = abs(float(description.get("spacing") or 0))
     units = [description.get(f"{axis}unit", description.get("unit")) for axis in "zyx"]
     units = units if z else [units[2], *units[1:]]  # the distance of slices is then taken as the pixel's
     if all(is_unit(unit) and parse_unit(unit)[0] == "voxel" for unit in units):
         steps = (z * x if z else 1.0, x / y, 1.0)  # without a unit only ratios have a meaning: in pixels along x
-        return (None if np.allclose(steps, 1) else steps), _UNKNOWN[1], ()
-    return (z or 1 / x, 1 / y, 1 / x), units, () if z else (base.NO_DISTANCE,)
+        return {} if np.allclose(steps, 1) else {"steps": steps}
+    return {"steps": (z or 1 / x, 1 / y, 1 / x), "units": units, "guesses": () if z else (base.NO_DISTANCE,)}
 
 
 def _from_tags(file: tifffile.TiffFile) -> _Spacing:
-    """Return steps, units and a note from the resolution tags, unless they are a program's default."""
+    """Return steps, units and a guess from the resolution tags, unless they are a program's default."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
     if unit is None or min(x, y) <= 0:
-        return _UNKNOWN
+        return {}
     dots_per_inch = x * (2.54 if unit == "cm" else 1.0)
     if any(abs(dots_per_inch - screen) < 0.51 for screen in _SCREEN):
-        return _UNKNOWN
-    return (1 / x, 1 / y, 1 / x), (unit,) * 3, (base.NO_DISTANCE,)
+        return {}
+    return {"steps": (1 / x, 1 / y, 1 / x), "units": (unit,) * 3, "guesses": (base.NO_DISTANCE,)}
 
 
 def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
