@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
-import io
 import os
 import re
 import shutil
@@ -96,11 +94,6 @@ def remove(path: Path) -> None:
             shutil.rmtree(doomed)
     else:
         path.unlink(missing_ok=True)
-
-
-def open_packaged(room: str, name: str) -> io.BytesIO:
-    """Return a file of this package, in the `data` of a room such as `inference`, as an open file."""
-    return io.BytesIO((importlib.resources.files(f"curvafit.{room}") / "data" / name).read_bytes())
 
 
 # ---- folders ---------------------------------------------------------------------------------------------------------

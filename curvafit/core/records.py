@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import io
 import json
 import math
@@ -132,6 +133,13 @@ class Format:
         except _FAULTS as error:
             reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)[:200]
             raise ValueError(f"{place} is not {self.title} that can be read: {reason}") from error
+
+    def read_packaged(
+        self, room: str, name: str, build: Callable[[dict[str, Any], dict[str, np.ndarray]], Content] = Record
+    ) -> Content:
+        """Return what `read` does of a file of this package, in the `data` of a room such as `inference`."""
+        content = (importlib.resources.files(f"curvafit.{room}") / "data" / name).read_bytes()
+        return self.read(io.BytesIO(content), build, place=f"the packaged {name}")
 
     def owns(self, path: Path) -> bool:
         """Return whether a file, or a Zarr store of images, names this format in its header, whatever its version."""

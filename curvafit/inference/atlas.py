@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule
 from curvafit.geometry.diagrams import Diagram
@@ -106,7 +105,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     another format version.
     """
     if path is None:
-        return ATLAS_FILE.read(open_packaged("inference", "atlas.npz"), _from_arrays, place="the packaged atlas")
+        return ATLAS_FILE.read_packaged("inference", "atlas.npz", _from_arrays)
     if Path(path).is_dir():
         raise FileNotFoundError(f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one")
     return ATLAS_FILE.read(path, _from_arrays)

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 
 from curvafit.core.checks import check_float, check_int, require
-from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule
 from curvafit.core.units import format_number
@@ -249,10 +248,9 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
     Raises FileNotFoundError if there is no such file, and ValueError if it is not a posterior, is damaged, or has
     another format version or other blocks.
     """
-    if path is not None:
-        return POSTERIOR_FILE.read(path, _from_arrays)
-    file = open_packaged("inference", "posterior.npz")
-    return POSTERIOR_FILE.read(file, _from_arrays, place="the packaged posterior")
+    if path is None:
+        return POSTERIOR_FILE.read_packaged("inference", "posterior.npz", _from_arrays)
+    return POSTERIOR_FILE.read(path, _from_arrays)
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:

@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from curvafit.core.checks import check_float, check_int
-from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance
@@ -486,8 +485,7 @@ class Taught:
         FileNotFoundError if there is no such file, and ValueError if it is something else, damaged, of another version,
         or taught otherwise with regard to images."""
         if path is None:
-            packaged = open_packaged("segmentation", "image.npz" if image else "filler.npz")
-            return FILLER_FILE.read(packaged, cls._of, place="the packaged filler")
+            return FILLER_FILE.read_packaged("segmentation", "image.npz" if image else "filler.npz", cls._of)
         taught = FILLER_FILE.read(path, cls._of)
         if taught.filler.image != image:
             ways = ("with", "without") if image else ("without", "with")
