@@ -216,8 +216,8 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
         filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks), None
         inside = flow_summary(filled.share)
     else:
-        problem, store, workers = SlicesProblem(trial, slices, engine.level(slices)), working.store, working.workers
-        lowered = lower_volume(problem, grid, tiles, store=store, workers=workers, progress=progress)
+        problem = SlicesProblem(trial, slices, engine.level(slices))
+        lowered = lower_volume(problem, grid, tiles, working=working, progress=progress)
         filled, engine = _weigh_evidence(engine, trial, task, known, slices, lowered)
         phase, notes = known.turn_back(lowered.phase), (*notes, *grid.notes)
         inside = flow_summary(float(lowered.mask.mean()), lowered.energies, lowered.steps)

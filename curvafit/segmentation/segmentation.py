@@ -107,7 +107,7 @@ def segment(
     if missing := _missing_phase(evidence, tiles):
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
     problem = EvidenceProblem(trial, evidence)
-    lowered = lower_volume(problem, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    lowered = lower_volume(problem, grid, tiles, working=working, progress=progress)
     if weight is None and not _explains(evidence, lowered.mask, tiles):
         trial, head = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         lowered = lower_volume(EvidenceProblem(trial, evidence), grid, tiles)
@@ -139,7 +139,7 @@ def _segment_probabilities(
     notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
     without_surface = trial.law is not None and _missing_phase(evidence, tiles)  # there is nothing to lower then
     problem = EvidenceProblem(replace(trial, law=None) if without_surface else trial, evidence)
-    lowered = lower_volume(problem, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    lowered = lower_volume(problem, grid, tiles, working=working, progress=progress)
     return _describe(volume, lowered, trial, grid, notes, head)
 
 

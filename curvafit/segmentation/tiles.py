@@ -11,15 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
-from os import PathLike
 
 import numpy as np
 
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Cluster
 from curvafit.generation.loop import identity
 from curvafit.generation.problem import Data
-from curvafit.segmentation.flow import WorkingGrid, lower_energy
+from curvafit.segmentation.flow import Working, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.run import Record, open_run
 from curvafit.volumes.volume import Box, grow, within
@@ -88,15 +86,13 @@ def lower_volume(
     grid: WorkingGrid,
     tiles: Sequence[Box],
     *,
-    store: str | PathLike[str] | None = None,
-    workers: Cluster | int | None = None,
+    working: Working = Working(),
     progress: Progress = silent,
 ) -> LoweredVolume:
     """Lower a problem on each tile of a volume (`cut_tiles`), and return the whole. Of several tiles, finished ones are
-    kept in the `store`, from which a killed run goes on, and workers share them."""
+    kept in the store of `working`, from which a killed run goes on, and its workers share them."""
     trial, shape = problem.trial, tuple(edge.stop for edge in tiles[-1])  # the last tile ends with the volume
-    if len(tiles) == 1:
-        store, workers = None, None
+    store, workers = (None, None) if len(tiles) == 1 else (working.store, working.workers)
     settings = {}
     if store is not None:  # digests take a while
         counts = tuple(len({tile[axis].start for tile in tiles}) for axis in range(3))
