@@ -65,17 +65,12 @@ class Block(nn.Module):
         y = self.first(x)
         if self.skip is not None and skip is not None:
             y = (y.unflatten(0, (len(skip), -1)) + self.skip(skip)[:, None]).flatten(0, 1)
-        y = _normalise(y)
+        # The root mean square is over channels: one over pixels too would depend on the background around a structure.
+        y = y * torch.rsqrt(y.square().mean(1, keepdim=True) + 1e-3)
         if self.condition is not None and condition is not None:
             scale, shift = self.condition(condition)[..., None, None].chunk(2, dim=1)
             y = torch.addcmul(shift, y, 1 + scale)
         return self.shortcut(x) + self.second(F.silu(y))
-
-
-def _normalise(x: Tensor) -> Tensor:
-    """Divide features by their root mean square over the channels of each pixel."""
-    # A mean over pixels too would depend on how much background there is around a structure.
-    return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-3)
 
 
 @dataclass(frozen=True)

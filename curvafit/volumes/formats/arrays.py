@@ -50,7 +50,7 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
 def _is_attribute(archive: zipfile.ZipFile, name: str) -> bool:
     """Return whether an array is named like a spacing and is a few numbers, or is named like a unit and is text."""
     is_unit_name = name in ("unit", "units")
-    if not is_unit_name and not base.is_place_name(name):
+    if not is_unit_name and name != "offset" and not base.SPACING.search(name):
         return False
     with archive.open(f"{name}.npy") as stream:
         version = np.lib.format.read_magic(stream)

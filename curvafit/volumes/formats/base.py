@@ -20,7 +20,7 @@ from curvafit.core.runtime import memory, one_line
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: Names of attributes that look like a spacing.
-_SPACING = re.compile("spacing|resolution|(voxel|pixel|element)_?size", re.IGNORECASE)
+SPACING = re.compile("spacing|resolution|(voxel|pixel|element)_?size", re.IGNORECASE)
 #: What is assumed of slices whose distance a file does not state.
 NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
 #: Bytes of one read.
@@ -118,7 +118,7 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
     """
     names = ("element_size_um", "spacing", "voxel_size", "resolution")
     used = next((name for name in names if name in attributes), "")
-    unused = [name for name in attributes if _SPACING.search(name) and name != used]
+    unused = [name for name in attributes if SPACING.search(name) and name != used]
     notes = (f"It has {', '.join(unused)[:200]}, which is not used.",) if unused else ()
     if not used:
         return {"notes": notes}
@@ -128,11 +128,6 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
     sizes = sizes * ndim if len(sizes) == 1 else sizes
     geometry: dict[str, Any] = {"steps": sizes, "units": (unit,) * len(sizes), "notes": notes}
     return geometry | ({"origin": _entries(attributes["offset"])} if "offset" in attributes else {})
-
-
-def is_place_name(name: str) -> bool:
-    """Return whether `read_spacing` uses an attribute as lengths, or notes that it does not."""
-    return name == "offset" or _SPACING.search(name) is not None
 
 
 def _entries(value: Any) -> tuple[Any, ...]:

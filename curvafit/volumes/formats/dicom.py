@@ -88,7 +88,7 @@ def _stack(planes: list[_Plane], path: Path) -> Stated:
         notes = ["The slices state no position: they are stacked in the order of their numbers."]
         if (spacing := planes[0].spacing) is not None:
             notes.append(f"Their PixelSpacing, {spacing.tolist()} mm, is not used without a distance of them.")
-        return _concatenate(planes)._replace(notes=tuple(notes))
+        return _concatenate(planes, notes=tuple(notes))
     along_rows, along_columns = planes[0].directions  # type: ignore[misc]
     normal = np.cross(along_rows, along_columns)
     planes = sorted(planes, key=lambda plane: float(np.dot(normal, plane.position)))  # type: ignore[arg-type]
@@ -97,12 +97,12 @@ def _stack(planes: list[_Plane], path: Path) -> Stated:
         return _concatenate(planes)
     y, x = (float(h) for h in planes[0].spacing)
     affine = base.affine_of(np.column_stack([along_rows * x, along_columns * y, normal * z]), origin)
-    return _concatenate(planes)._replace(steps=(z, y, x), units=("mm",) * 3, affine=LPS_TO_RAS @ affine)
+    return _concatenate(planes, steps=(z, y, x), units=("mm",) * 3, affine=LPS_TO_RAS @ affine)
 
 
-def _concatenate(planes: list[_Plane]) -> Stated:
+def _concatenate(planes: list[_Plane], **stated: Any) -> Stated:
     values = np.stack([plane.values for plane in planes])
-    return Stated(values, "zyxs"[: values.ndim])
+    return Stated(values, "zyxs"[: values.ndim], **stated)
 
 
 def _read_image(pydicom: Any, file: Path) -> Any:
