@@ -457,10 +457,15 @@ def main() -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace a file of another origin")
     options = parser.parse_args()
     try:
-        with plain_errors(), resumable(), show_stages() as progress:
+        with plain_errors(), resumable(checkpoint_of(options.output)), show_stages() as progress:
             run(options, progress)
     except typer.Exit as end:
         sys.exit(end.exit_code)
+
+
+def checkpoint_of(out: Path) -> Path:
+    """Return the file beside the weights in which steps are kept until they are written."""
+    return out.with_name(f".{out.name}.curvafit-steps")
 
 
 def run(options: argparse.Namespace, progress: Progress) -> None:
@@ -470,7 +475,7 @@ def run(options: argparse.Namespace, progress: Progress) -> None:
         raise ValueError(f"the output's name must end in .npz, got {out.name}")
     inputs = [*options.sources, *([options.filler] if options.filler else [])]
     can_write(out, FILLER_FILE, inputs=inputs, overwrite=options.overwrite)
-    checkpoint = out.with_name(f".{out.name}.curvafit-steps")
+    checkpoint = checkpoint_of(out)
     # With images, a filler that was taught on masks alone learns to use them.
     first = Taught.load(options.filler) if options.images or options.filler else None
     sources, card = load_textures(options.sources, progress)

@@ -752,7 +752,7 @@ def main() -> None:
     try:
         with (
             plain_errors(),
-            resumable(lambda: "the same command" if options.run is run_describe else ""),
+            resumable(options.output if options.run is run_describe else None),
             show_stages() as progress,
         ):
             if options.output.suffix != ".npz":

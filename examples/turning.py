@@ -95,7 +95,7 @@ def write_moving(turns: list[list[Image.Image]], path: Path) -> None:
             sheet.alpha_composite(picture.resize((SMALLER, SMALLER), Image.Resampling.LANCZOS), (SMALLER * k, 0))
         frames.append(sheet.convert("RGB"))
     pixels = np.concatenate([np.asarray(frame).reshape(-1, 3) for frame in frames])
-    palette = Image.fromarray(pixels[pixels.min(1) < 255][None]).quantize(COLOURS - 1)
+    palette = Image.fromarray(pixels[pixels.min(1) < 250][None]).quantize(COLOURS - 1)
     palette.putpalette([*(palette.getpalette() or [])[: 3 * (COLOURS - 1)], 255, 255, 255])
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=PAUSE, loop=0, optimize=True)

@@ -231,7 +231,7 @@ def _interpolate_curvatures(
     numbers.ravel()[voxels] = np.arange(len(voxels))
     distance = profile_distance(values, epsilon)
     if curvature == "geometric":
-        κ1, κ2, slope = _measure_levels(distance.contiguous().numpy(), grid.spacing, grid.periodic, voxels)
+        κ1, κ2, slope = measure_levels(distance.contiguous().numpy(), grid.spacing, grid.periodic, voxels)
     else:
         slopes = jet(distance, grid).gradient.square().sum(-4).sqrt()
         fields = (*diffuse_curvatures(jet(values, grid), epsilon)[:2], slopes)
@@ -290,7 +290,7 @@ def _continue(k, n, periodic):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _measure_levels(u, spacing, periodic, voxels):  # pragma: no cover
+def measure_levels(u, spacing, periodic, voxels):  # pragma: no cover
     """Return κ1 and κ2 as `priors.curvature.geometric_curvatures` has them, and |∇u|, at voxels, flat indices."""
     (nz, ny, nx), (hz, hy, hx) = u.shape, spacing
     κ1, κ2, slope = np.empty(len(voxels)), np.empty(len(voxels)), np.empty(len(voxels))

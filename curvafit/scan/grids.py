@@ -25,6 +25,8 @@ MEASURED = 160
 #: Deviations, in voxels, of the Gaussians that smooth stairs after that of `priors.profile.STAIRS`, where the border
 #: moves by less than so many voxels, a root mean square over what is near: a Gaussian, in a band on either side.
 WIDER, MOVED, NEARBY, BAND = (2.5, 3.0), 0.1, 2.0, 2.5
+#: Part of the voxels below which Gaussians are added one by one.
+FEW = 1 / 150
 #: Numbers that a processor adds at once, and an index that is not negative.
 _LANES, _at = 8, np.uint64
 #: Voxels of a periodic mask beyond its box on which its phase field depends.
@@ -53,17 +55,15 @@ class Thickness:
 
     def __call__(self, mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False) -> np.ndarray:
         """Return `local_thickness` of a mask of the scan; the result is not to be written to."""
-        with self._lock:
-            asked = [future for known, future in self._known if np.array_equal(known, mask)]
-            future = asked[0] if asked else Future[np.ndarray]()
-            if not asked:
-                self._known.append((mask, future))
-        if not asked:
-            try:
-                future.set_result(local_thickness(mask, spacing, periodic=periodic))
-            except BaseException as reason:
-                future.set_exception(reason)
-        return future.result()
+        mine = Future[np.ndarray]()
+        try:
+            with self._lock:
+                asked = [future for known, future in self._known if np.array_equal(known, mask)]
+                self._known.append((mask, mine))
+            mine.set_result(asked[0].result() if asked else local_thickness(mask, spacing, periodic=periodic))
+        except BaseException as reason:  # a signal too: who waits is told
+            mine.set_exception(reason)
+        return mine.result()
 
 
 def median_thickness(
@@ -191,7 +191,7 @@ def profile_mask(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
         ratio /= np.maximum(near, np.float32(1e-6), out=near)
         ratio /= np.float32(-(MOVED**2))
         distance += np.multiply(np.exp(ratio, out=ratio), move, out=move)
-    _restore_signs(distance, mask)
+    restore_signs(distance, mask, voxels)
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
     return np.tanh(distance, out=distance)
 
@@ -205,14 +205,19 @@ def _smooth_stairs(distance: np.ndarray, voxels: Grid, width: float) -> np.ndarr
     return blurred
 
 
-def _restore_signs(distance: np.ndarray, mask: np.ndarray) -> None:
-    """Add a Gaussian wherever the sign of a distance is not the mask's, in place, until none is: few voxels are."""
+def restore_signs(distance: np.ndarray, mask: np.ndarray, voxels: Grid) -> None:
+    """Add a Gaussian wherever the sign of a distance is not the mask's, in place, until none is: one by one where few
+    voxels are, and by a blur of all where many are, as in a noisy mask."""
     taps = np.array(gaussian_taps(PULL_WIDTH), np.float32)
     kernel = np.pad(taps[:, None, None] * taps[:, None] * taps, ((0, 0), (0, 0), (0, -len(taps) % _LANES)))
     for _ in range(SWEEPS):
         places = np.flatnonzero((distance > 0) != mask)
         if not len(places):
             break
+        if len(places) > FEW * distance.size:
+            errors = np.where((distance > 0) != mask, distance, np.float32(0))
+            distance -= np.float32(PULL) * gaussian_blur(errors, voxels, PULL_WIDTH)
+            continue
         _add_gaussians(distance, places, np.float32(-PULL) * distance.ravel()[places], kernel)
 
 

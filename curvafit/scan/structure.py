@@ -210,7 +210,7 @@ def read_labels(labels: Volume, what: str) -> np.ndarray:
 
 def whole_labels(values: np.ndarray, what: str) -> np.ndarray:
     """Return labels that are nearly whole numbers as integers; raise ScanError if some are not."""
-    rounded = round_labels(values)
+    rounded = round_labels(values.astype(np.uint8) if values.dtype == bool else values)
     whole = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
     if (whole != rounded).any():
         raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")

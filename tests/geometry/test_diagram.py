@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.geometry import distances as module
-from curvafit.geometry.diagrams import Diagram, _measure_levels, diagram, family_of, family_shares
+from curvafit.geometry.diagrams import Diagram, diagram, family_of, family_shares, measure_levels
 from curvafit.geometry.distances import one_to_many, pairwise, sliced_embedding, wasserstein
 from curvafit.inference.atlas import load_atlas
 from curvafit.priors.curvature import geometric_curvatures, jet
@@ -59,7 +59,7 @@ def test_curvatures_at_voxels_are_those_of_the_energy(periodic: bool) -> None:
     grid = Grid((7, 8, 9), (1.0, 1.1, 0.9), "periodic" if periodic else "replicate")
     u = torch.randn(grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = geometric_curvatures(jet(u, grid))[:2]
-    *found, slope = _measure_levels(u.numpy(), grid.spacing, periodic, np.arange(u.numel()))
+    *found, slope = measure_levels(u.numpy(), grid.spacing, periodic, np.arange(u.numel()))
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs.flatten(), rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(slope**2, jet(u, grid).gradient.square().sum(-4).flatten(), rtol=1e-12)

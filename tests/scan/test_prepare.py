@@ -13,9 +13,9 @@ from shapes import grown
 
 from curvafit.geometry.diagrams import diagram
 from curvafit.priors import Grid, phase_field, profile
+from curvafit.priors.stencils import gaussian_blur
 from curvafit.scan import preparation as preparing
 from curvafit.scan.grids import (
-    _restore_signs,
     box_by_surface,
     candidate_boxes,
     centre_distance,
@@ -23,6 +23,7 @@ from curvafit.scan.grids import (
     profile_mask,
     remove_specks,
     resample,
+    restore_signs,
 )  # fmt: skip
 from curvafit.scan.preparation import WORKING_THICKNESS, Prepared, is_ball, prepare, read_scan, thinner_thickness
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
@@ -125,14 +126,18 @@ def test_what_is_thick_is_smoothed_more_widely(radius: int, share: float) -> Non
     assert found.mean().mean() * radius == pytest.approx(1, abs=0.06 if radius == 4 else 0.02)
 
 
-def test_few_gaussians_restore_signs_as_blurs_of_all_voxels_do() -> None:
-    """Up to the faces, beyond which both continue as a mirror image."""
+@pytest.mark.parametrize("wrong", [0.003, 0.02])
+def test_signs_are_restored_one_by_one_as_by_a_blur_of_all(wrong: float) -> None:
+    """Few or many, up to the faces, beyond which both continue as a mirror image."""
     noise = np.random.default_rng(0)
     distance = noise.standard_normal((18, 20, 31)).astype(np.float32)
-    mask = (distance > 0) != (noise.random(distance.shape) < 0.01)
+    mask = (distance > 0) != (noise.random(distance.shape) < wrong)
     voxels = Grid(mask.shape, (1.0, 1.0, 1.0), "replicate")
-    expected = profile._restore_signs(torch.from_numpy(distance), torch.from_numpy(mask), voxels)
-    _restore_signs(distance, mask)
+    expected = torch.from_numpy(distance.copy())
+    for _ in range(profile.SWEEPS):
+        error = torch.where((expected > 0) != torch.from_numpy(mask), expected, 0)
+        expected -= profile.PULL * gaussian_blur(error, voxels, profile.PULL_WIDTH)
+    restore_signs(distance, mask, voxels)
     assert np.abs(distance - expected.numpy()).max() < 1e-4
 
 

@@ -271,8 +271,8 @@ def test_maps_are_those_of_the_whole_on_the_scan_s_voxels(name: str) -> None:
     assert thickness[structure > 0].mean() == pytest.approx(whole["Tb.Th"].value, rel=1e-5)
     for each, volume in whole.maps.items():
         assert np.allclose(in_tiles.maps[each].values, volume.values, rtol=1e-5), each
-    region = np.zeros(scan.shape, np.uint8)
-    region[4:20, 10:40, 8:] = 1
+    region = np.zeros(scan.shape, bool)
+    region[4:20, 10:40, 8:] = True
     part = measure(scan, roi=region, maps=True).maps["structure"].values
     assert (part == structure * region).all()
     assert not measure(scan).maps
