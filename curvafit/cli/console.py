@@ -78,7 +78,8 @@ def plain_errors() -> Iterator[None]:
     except typer.Exit:
         _say_warnings(caught)
         raise
-    except KeyboardInterrupt as signal:
+    except (KeyboardInterrupt, SystemError) as error:
+        signal = _signal_of(error)
         say(f"{_name_signal(signal)}: nothing is left half-written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
@@ -93,7 +94,8 @@ def resumable(kept: Path | None) -> Iterator[None]:
     """On a signal, say that the same command resumes, if finished parts are in the file or folder `kept`."""
     try:
         yield
-    except KeyboardInterrupt as signal:
+    except (KeyboardInterrupt, SystemError) as error:
+        signal = _signal_of(error)
         if kept is None or not kept.exists():
             raise
         say(f"{_name_signal(signal)}: finished parts are saved. Run the same command to resume", to=error_console())
@@ -114,6 +116,14 @@ def keep_parts(store: Path | None) -> Iterator[None]:
             raise
     if store is not None:
         remove(store)
+
+
+def _signal_of(error: KeyboardInterrupt | SystemError) -> KeyboardInterrupt:
+    """Return the signal that ended a command, or that compiled code met, whose SystemError it causes; raise another."""
+    signal = error.__cause__ if isinstance(error, SystemError) else error
+    if not isinstance(signal, KeyboardInterrupt):
+        raise error
+    return signal
 
 
 def _name_signal(signal: KeyboardInterrupt) -> str:

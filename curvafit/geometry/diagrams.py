@@ -303,9 +303,9 @@ def measure_levels(u, spacing, periodic, voxels):  # pragma: no cover
         gz, zz = (u[A, y, x] - u[a, y, x]) / (2 * hz), (u[A, y, x] - twice + u[a, y, x]) / hz**2
         gy, yy = (u[z, B, x] - u[z, b, x]) / (2 * hy), (u[z, B, x] - twice + u[z, b, x]) / hy**2
         gx, xx = (u[z, y, C] - u[z, y, c]) / (2 * hx), (u[z, y, C] - twice + u[z, y, c]) / hx**2
-        zy = (u[A, B, x] + u[a, b, x] - u[A, b, x] - u[a, B, x]) / (4 * hz * hy)
-        zx = (u[A, y, C] + u[a, y, c] - u[A, y, c] - u[a, y, C]) / (4 * hz * hx)
-        yx = (u[z, B, C] + u[z, b, c] - u[z, B, c] - u[z, b, C]) / (4 * hy * hx)
+        zy = ((u[A, B, x] - u[A, b, x]) - (u[a, B, x] - u[a, b, x])) / (4 * hz * hy)
+        zx = ((u[A, y, C] - u[A, y, c]) - (u[a, y, C] - u[a, y, c])) / (4 * hz * hx)
+        yx = ((u[z, B, C] - u[z, B, c]) - (u[z, b, C] - u[z, b, c])) / (4 * hy * hx)
         square = gz * gz + gy * gy + gx * gx
         length2 = square + XI * XI
         normal = gz * (gz * zz + 2 * (gy * zy + gx * zx)) + gy * (gy * yy + 2 * gx * yx) + gx * gx * xx

@@ -79,7 +79,7 @@ def measure(
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
     eight has none. A stack of under ten slices may have no curvature (NaN, and a note), a structure that is nowhere 3
-    voxels thick has none. A scan with a side of more than `LARGEST_BOX` voxels is measured in tiles, which have the
+    voxels thick has none. A scan of more than `LARGEST_BOX`³ voxels is measured in tiles, which have the
     numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW and uncompressed NIfTI no more than a tile is in memory.
     Raises ValueError if the scan has no structure, a region does not fit it or it repeats, or a large scan repeats and
     does not fit into memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
@@ -116,7 +116,7 @@ def measure(
         region, region_notes = _read_compartments(roi, volume, scan, reading)
         volume = replace(volume, notes=(*volume.notes, *region_notes))
     volume, unit, edge = _count_in_edges(volume), volume.unit, min(volume.spacing)
-    if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
+    if periodic or (region is None and tile is None and math.prod(volume.shape) <= LARGEST_BOX**3):
         check_memory(volume.shape, WORKED, "a scan in one piece")
         try:
             found, arrays = _measure_whole(volume.load(), periodic, progress, **options)  # type: ignore[arg-type]
@@ -190,13 +190,16 @@ def _describe_tiles(plan: Plan, processes: int) -> str:
     return f"Measured in {len(plan.cores)} tiles of {sides} voxels, in about {size:.2g} GB of memory."
 
 
-def _choose_edges(plan: Plan) -> tuple[int, ...]:
-    """Return the edges of tiles, in voxels, of at most `LARGEST_TILE` voxels with their surroundings, on both grids."""
-    side = round(LARGEST_TILE ** (1 / 3))
-    distance = _read_distance(plan.reach, min(plan.volume.spacing))
+def _choose_edges(plan: Plan, processes: int) -> tuple[int, ...]:
+    """Return the edges of tiles, in voxels, of at most `LARGEST_TILE` voxels with their surroundings, on both grids; or
+    of more where balls are so wide that a core would be less than half of its tile's edge, and memory allows it."""
+    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.volume.spacing)
+    distance = _read_distance(min(plan.reach, WIDEST * finest), finest)
+    affordable = (memory() / (4 * processes * WORKED)) ** (1 / 3)
+    wide = max(side, int(min(4 * distance / finest, affordable)))
     edges = []
     for n, h, scale in zip(plan.volume.shape, plan.volume.spacing, plan.scale, strict=True):
-        longest = min(side - 2 * math.ceil(distance / h), int((side - 2 * HALO) * scale))
+        longest = min(wide - 2 * math.ceil(distance / h), int((side - 2 * HALO) * scale))
         count = math.ceil(n / max(SHORTEST, longest))
         edges.append(math.ceil(n / count))
     return tuple(edges)
@@ -518,7 +521,9 @@ def _measure_tiles(
         options |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
     with open_run(workers, store, options, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(structure, run)
-        plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))), maps=maps)
+        plan = replace(
+            plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan, run.processes))), maps=maps
+        )
         tiles_note = _describe_tiles(plan, run.processes)
         records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), tiles_note)
         # The factors that `morphology.local_thickness` would choose for the whole volume.

@@ -278,6 +278,14 @@ def test_maps_are_those_of_the_whole_on_the_scan_s_voxels(name: str) -> None:
     assert not measure(scan).maps
 
 
+def test_wide_gaps_do_not_cut_a_scan_into_small_tiles() -> None:
+    """Their balls reach over 100 voxels around a tile: cores of a few voxels would read all of it many times."""
+    mask = np.zeros((128, 128, 128), bool)
+    mask[4:12] = mask[118:126] = True
+    found = measure(mask, roi=np.ones(mask.shape, np.uint8))
+    assert not [note for note in found.notes if "tiles" in note]
+
+
 def test_maps_of_wide_balls_are_painted_where_they_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiles, "COARSE", 3)
     mask = np.zeros((40, 40, 40), np.uint8)
