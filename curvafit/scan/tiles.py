@@ -18,7 +18,7 @@ import numpy as np
 
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, check_memory, memory, silent
-from curvafit.core.units import format_sampling
+from curvafit.core.units import format_sampling, power_name
 from curvafit.core.workers import Cluster
 from curvafit.geometry.balls import NEAR, border_distance, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagrams import BIN_WIDTH, MARGIN, Diagram
@@ -115,7 +115,7 @@ def measure(
     if roi is not None:
         region, region_notes = _read_compartments(roi, volume, scan, reading)
         volume = replace(volume, notes=(*volume.notes, *region_notes))
-    volume, unit, edge = _count_in_edges(volume), volume.unit, min(volume.spacing)
+    volume, unit, edge = _count_in_edges(volume, region), volume.unit, min(volume.spacing)
     if periodic or (region is None and tile is None and math.prod(volume.shape) <= LARGEST_BOX**3):
         check_memory(volume.shape, WORKED, "a scan in one piece")
         try:
@@ -131,13 +131,17 @@ def measure(
     return _keep_maps(found.scale(edge, unit), arrays, frame, edge, region)
 
 
-def _count_in_edges(volume: Volume) -> Volume:
-    """Return a volume whose lengths are counted in its finest edge, with a note on its voxels: which of two lengths is
-    greater must not depend on a unit."""
-    spacing, finest = volume.spacing, min(volume.spacing)
-    note = f"{format_sampling(volume.shape, spacing, volume.unit)}."
+def _count_in_edges(volume: Volume, region: Volume | None) -> Volume:
+    """Return a volume whose lengths are counted in its finest edge, with a note on its voxels and its region: which of
+    two lengths is greater must not depend on a unit."""
+    spacing, unit, finest = volume.spacing, volume.unit, min(volume.spacing)
+    note = format_sampling(volume.shape, spacing, unit)
+    if region is not None:
+        size, power = np.count_nonzero(region.values) * math.prod(spacing), power_name(unit, 3)
+        size, power = (1e-9 * size, "mm³") if unit == "um" and size >= 1e6 else (size, power)
+        note += f", measured within a region of interest of {float(f'{size:.3g}'):.15g} {power}"
     edges: Any = tuple(round(h / finest, 12) for h in spacing)
-    return replace(volume, spacing=edges, unit="voxel", affine=None, notes=(note, *volume.notes))
+    return replace(volume, spacing=edges, unit="voxel", affine=None, notes=(f"{note}.", *volume.notes))
 
 
 def _read_compartments(

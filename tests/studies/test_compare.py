@@ -419,6 +419,11 @@ def test_each_scan_is_measured_in_its_region(home: Path) -> None:
     alone = [measure(path, roi=path.replace(".npy", "_roi.npy")) for path in SCANS]
     assert [scan["BV/TV"].value for scan in found.measures] == [scan["BV/TV"].value for scan in alone]
     assert found.measures[0]["BV/TV"].value != measure(SCANS[0])["BV/TV"].value
+    where = "32 x 32 x 32 voxels, measured within a region of interest of 25100 voxel³"  # 28² · 32
+    assert f"All 6 scans: {where}." in found.notes and where in describe_methods(found)
+    sized = [measure(Volume(tubes(5.0), (h,) * 3, unit), roi=np.load("control/m0_roi.npy")).notes[0]
+             for h, unit in ((0.02, "mm"), (20.0, "um"), (0.5, "um"))]  # fmt: skip
+    assert [note.rpartition(" of ")[2] for note in sized] == ["0.201 mm³.", "0.201 mm³.", "3140 µm³."]
 
 
 def test_nothing_is_measured_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
