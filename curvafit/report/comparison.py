@@ -27,7 +27,6 @@ from curvafit.report.page import (
     MOST_OUTLINES,
     Chosen,
     check_result_folder,
-    name_parts,
     outlines_figure,
     render,
     start_record,
@@ -83,7 +82,8 @@ def write_comparison(
         "methods": describe_methods(c), "count": c.count, "of_bodies": c.of_bodies,
         "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
-    outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
+    names = [f"{case.label if c.groups else f'{c.by} {case.label:g}'} · {Path(case.name).name}" for case in c.cases]
+    outlines = outlines_figure(names, [scan.outline for scan in c.measures], c.unit)
     figures = {
         "difference": (None if c.of_bodies else comparison_figure(c), "Mean curvature diagrams and their difference"),
         "numbers": (numbers_figure(c, _choose_shown(c)), f"Familiar numbers, and those that differ, by {c.by}"),

@@ -30,8 +30,8 @@ from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
-#: Pixels per inch of figures in files; letters of a scan's name in a panel; the most scans whose outlines are drawn.
-PRINTED, WORD, MOST_OUTLINES = 300, 22, 25
+#: Pixels per inch of files; letters of a scan's name in a panel, and beside its outlines; the most scans with outlines.
+PRINTED, WORD, LINE, MOST_OUTLINES = 300, 22, 36, 25
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
 
@@ -177,15 +177,15 @@ def name_parts(parts: Sequence[Measures]) -> list[str]:
     return names
 
 
-def shorten(names: Sequence[str]) -> list[str]:
-    """Return names that a panel has room for: the end of a long name, with a number where two would be the same."""
-    short = [name if len(name) <= WORD else f"…{name[1 - WORD :]}" for name in names]
+def shorten(names: Sequence[str], most: int = WORD) -> list[str]:
+    """Return names that a panel has room for: both ends of a long name, with a number where two would be the same."""
+    short = [name if len(name) <= most else f"{name[:8]}…{name[9 - most :]}" for name in names]
     return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
 
 
 def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], unit: str) -> Figure | None:
     """Return a figure of what was taken for the structure in the first `MOST_OUTLINES` scans of one unit, or None."""
-    known = [(name, each) for name, each in zip(shorten(names), outlines, strict=True) if each][:MOST_OUTLINES]
+    known = [(name, each) for name, each in zip(shorten(names, LINE), outlines, strict=True) if each][:MOST_OUTLINES]
     if not known:
         return None
     figure = plot.make_figure(7.6, 2.6 * len(known), layout="constrained")

@@ -96,6 +96,8 @@ def list_cases(groups: Sequence[Group], by: str | Sequence[Any] | None, paired: 
                 notes.append(f"The groups have {common} names in common: they count as different subjects.")
                 cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
     cases = _name_labels(cases, by)
+    named = Counter((case.name, is_body(case.source) or not isinstance(case.label, str)) for case in cases)
+    cases = [case._replace(name=f"{case.label}/{case.name}") if named[case.name, False] > 1 else case for case in cases]
     _check_sources(cases)
     _check_labels(cases, paired)
     return cases, notes

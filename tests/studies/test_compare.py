@@ -378,6 +378,7 @@ def test_the_command_writes_a_folder_and_replaces_its_own(home: Path) -> None:
     done("compare", *SCANS, "--by", "a,a,b,b,$c,$c", "--periodic", "-o", "out")  # $c is no formula
     assert {path.name for path in (home / "out").iterdir()} == set(FILES)
     page = (home / "out" / "compare.html").read_text(encoding="utf-8")
+    assert "a · m0.npy" in (home / "out" / "outlines.svg").read_text(encoding="utf-8")
     assert not re.search(rf'src="(?!data:)|href="(?!{GLOSSARY}#)', page)  # it stands alone, but for its words
     command = json.loads((home / "out" / "compare.json").read_text(encoding="utf-8"))["command"]
     assert check_comparison(home / "out", command=command) == home / "out"

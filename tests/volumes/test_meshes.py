@@ -173,7 +173,9 @@ def test_in_a_folder_of_volumes_a_surface_is_no_scan(tmp_path: Path) -> None:
         for k in range(2):
             written(ball(R + k), tmp_path / group / f"{k}.stl")
     surfaces, notes = list_cases((tmp_path / "a", tmp_path / "b"), None, False)
-    assert [case.name for case in surfaces] == ["0.stl", "1.stl"] * 2 and "left aside" not in str(notes)
+    assert [case.name for case in surfaces] == ["a/0.stl", "a/1.stl", "b/0.stl", "b/1.stl"] and "left aside" not in str(
+        notes
+    )
     for k in range(2):
         np.save(tmp_path / "a" / f"{k}.npy", np.ones((8, 8, 8)))
     cases, notes = list_cases((tmp_path / "a", tmp_path / "b"), None, False)
