@@ -9,6 +9,7 @@ threshold.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -53,6 +54,8 @@ PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
 #: A threshold is moved by so much of the contrast to see what that changes, and is weak where that is so much of the
 #: structure.
 MOVED, WEAK = 0.1, 0.1
+#: Otsu's threshold in the note of `describe_image`.
+OTSU = re.compile(r"split at Otsu's threshold of ([^:]+):")
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 #: Values of a box that count for a threshold.

@@ -23,7 +23,7 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.instances import OF_BODIES
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
-from curvafit.studies.scans import Case, Group, gather_notes, is_body, list_cases, measure_scans
+from curvafit.studies.scans import Case, Group, describe_groups, gather_notes, is_body, list_cases, measure_scans
 
 #: Most arrangements of the labels that are tried; all are, where there are no more.
 PERMUTATIONS = 9999
@@ -361,7 +361,7 @@ def _compare_measures(
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         least=float(least_p), sides=sides, permutations=len(arrangements), exact=exact, options=options,
-        notes=(*notes, *gather_notes(measures, cases)), **of_diagrams,
+        notes=(*describe_groups(measures, cases), *notes, *gather_notes(measures, cases)), **of_diagrams,
     )  # fmt: skip
 
 

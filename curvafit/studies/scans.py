@@ -31,6 +31,7 @@ from curvafit.core.workers import cluster, run_jobs
 from curvafit.geometry.diagrams import Diagram
 from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measures import COLUMNS, QUANTITIES, Measures, Quantity
+from curvafit.scan.structure import OTSU
 from curvafit.scan.tiles import measure
 from curvafit.volumes.formats.meshes import SUFFIXES as MESHES
 from curvafit.volumes.read import Source, load, pick_reader
@@ -530,12 +531,37 @@ def _bin_diagrams(measures: Measures) -> Measures:
     return replace(measures, diagram=measures.diagram.bin(width), compartments=binned)
 
 
+def describe_groups(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
+    """Yield notes on masks among the images of a group, and on the thresholds of groups."""
+    thresholds: dict[str, list[float]] = {}
+    for group, own in _list_members(cases).items():
+        kinds = Counter(measures[k].kind for k in own)
+        if kinds["image"] and kinds["mask"]:
+            counts = " and ".join(f"{kinds[kind]} {kind}{'s' * (kinds[kind] > 1)}" for kind in ("image", "mask"))
+            names = ", ".join(cases[k].name for k in own if measures[k].kind == "mask")
+            yield f"{group} has {counts} ({names}): is the mask a scan of its own?"
+        if levels := [float(level) for k in own for note in measures[k].notes for level in OTSU.findall(note)]:
+            thresholds[group] = [min(levels), max(levels)]
+    if thresholds:
+        texts = (f"{group} {' to '.join(map(format_number, sorted(set(own))))}" for group, own in thresholds.items())
+        apart = any(one[1] < other[0] for one, other in permutations(thresholds.values(), 2))
+        advice = ": they do not overlap; try one --threshold for all" * apart
+        yield f"Otsu's thresholds: {', '.join(texts)}{advice}."
+
+
+def _list_members(cases: Sequence[Case]) -> dict[str, list[int]]:
+    """Return the indices of the scans of each group; of a study by a number those of all."""
+    members: dict[str, list[int]] = {}
+    for k, case in enumerate(cases):
+        members.setdefault(case.label if isinstance(case.label, str) else "the study", []).append(k)
+    return members
+
+
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
     """Yield the scans' notes, each after the scans that have it; notes of one group that differ in numbers only are
     one, so that groups whose numbers differ, such as thresholds, are told apart."""
     scans_of: dict[str, list[int]] = {}
-    for label in dict.fromkeys(case.label if isinstance(case.label, str) else "" for case in cases):
-        own = [k for k, case in enumerate(cases) if label in ("", case.label)]
+    for own in _list_members(cases).values():
         for scans, note in merge_notes([measures[k] for k in own]):
             scans_of.setdefault(note, []).extend(own[k] for k in scans)
     for note, scans in scans_of.items():

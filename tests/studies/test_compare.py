@@ -427,6 +427,29 @@ def test_each_scan_is_measured_in_its_region(home: Path) -> None:
     assert [note.rpartition(" of ")[2] for note in sized] == ["0.201 mm³.", "0.201 mm³.", "3140 µm³."]
 
 
+def test_first_notes_are_thresholds_by_group_and_masks_among_images(home: Path) -> None:
+    """Thresholds lie apart in two groups of three; a mask that was left in a folder is asked about."""
+    for path, level in zip(SCANS, (80, 82, 85, 120, 125, 130), strict=True):
+        noise = np.random.default_rng(level).normal(0, 6, (N,) * 3)
+        np.save(path, np.rint(level * (0.5 + np.load(path)) + noise).astype(np.uint8))
+    found = compare("control", "treated")
+    first = re.fullmatch(
+        r"Otsu's thresholds: control (\S+) to (\S+), treated (\S+) to (\S+): they do not overlap; "
+        r"try one --threshold for all\.", found.notes[0],
+    )  # fmt: skip
+    assert first, found.notes
+    levels = [float(re.findall(r"threshold of (\S+):", " ".join(scan.notes))[0]) for scan in found.measures]
+    ends = [end(levels[own]) for own in (slice(3), slice(3, 6)) for end in (min, max)]
+    assert [float(end) for end in first.groups()] == pytest.approx(ends, rel=5e-3) and ends[1] < ends[2]
+    assert any(re.match(r"control/m\d\.npy( and \d more)?: Smoothed", note) for note in found.notes), found.notes
+    mixed = compare(SCANS, by=["a", "b"] * 3)
+    assert "overlap" not in mixed.notes[0] and mixed.notes[0].startswith("Otsu's thresholds: a ")
+    np.save("treated/x_otsu_mask.npy", balls(5.0))
+    notes = compare("control", "treated").notes
+    assert notes[0] == "treated has 3 images and 1 mask (x_otsu_mask.npy): is the mask a scan of its own?"
+    assert notes[1] == found.notes[0]
+
+
 def test_nothing_is_measured_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of `measure` is compared as its scans are, by any column that it was given; none is read again."""
     rows = [f"{path},{path[:7]},{k % 3},{k}" for k, path in enumerate(SCANS)]
