@@ -167,6 +167,8 @@ def test_odd_slices(tmp_path: Path) -> None:
         assert field.unit == ("um" if edge else "voxel")
         assert any(note in each for each in field.notes)
     assert any("_spr" in each for each in load(tmp_path / "bmp").notes)
+    for options, counts in (({"unit": "mm"}, True), ({"spacing": 5, "unit": "um"}, False)):
+        assert any("size is that of s_rec.log" in note for note in load(tmp_path / "bmp", **options).notes) == counts
     for name, word in (("types", "one type"), ("sizes", "one pixel size"), ("logs", "another pixel size")):
         unreadable(tmp_path / name, word)
     (tmp_path / "bmp" / "other.log").write_text("Pixel Size (um)=9")

@@ -215,7 +215,7 @@ def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
 # ---- folders of slices: TIFF, BMP, PNG or JPEG; those of NRecon with the voxel size of its log -----------------------
 
 
-def read_slices(path: Path, **_: object) -> Stated:
+def read_slices(path: Path, spacing: object = None, **_: object) -> Stated:
     """Read a folder of 2D slices in the natural order of their names, with the pixel size that they or a log state.
 
     Slices with labels of fewer than half of a volume, at uneven distances, are put at their numbers among empty ones.
@@ -238,14 +238,13 @@ def read_slices(path: Path, **_: object) -> Stated:
         if not _have_same_size(stated, first):
             raise ScanError(f"slices must have one pixel size, got another in {file.name} of {path}")
     assert first is not None
-    logged = _read_logs(path)
-    if logged is not None:
+    if (logged := _read_logs(path)) is not None:
         size, step, log = logged
         with_units = first._replace(units=[unit or first.custom for unit in first.units])
         if first.steps is not None and not _have_same_size(with_units, Stated(None, "zyx", [size] * 3, ["um"] * 3)):
             raise ScanError(f"{files[0].name} states another pixel size than the {size:g} µm of {log} in {path}")
         first = first._replace(steps=[step * size, size, size], units=["um"] * 3, guesses=())
-        notes += (f"The voxel size is that of {log}.",)
+        notes += (f"The voxel size is that of {log}.",) if spacing is None else ()
     axes = "zyxs"[: planes[0].ndim + 1]
     values, gaps = _place_slices(np.stack(planes), [file.stem for file in files])
     return first._replace(array=values, axes=axes, gaps=gaps, notes=(*first.notes, *notes))
