@@ -34,7 +34,7 @@ from curvafit.scan.measures import COLUMNS, QUANTITIES, Measures, Quantity
 from curvafit.scan.structure import OTSU
 from curvafit.scan.tiles import measure
 from curvafit.volumes.formats.meshes import SUFFIXES as MESHES
-from curvafit.volumes.read import Source, load, pick_reader
+from curvafit.volumes.read import SLICED, Source, load, pick_reader
 from curvafit.volumes.volume import ScanError
 
 #: A scan as a caller gives it, and a group: a folder of scans, scans, or scans by subject; `Measures`, of a scan or of
@@ -247,7 +247,7 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
         skipped += [case.name for case in meshes]
         cases = [case for case in cases if case not in meshes]
     if not cases:
-        raise ValueError(f"expected scans in the folder {folder}, got none that can be read")
+        raise ValueError(f"expected scans in the folder {folder}, got none that can be read{SLICED}")
     if skipped:
         notes.append(f"{len(skipped)} other files in {folder.name} were left aside: {', '.join(skipped[:3])}.")
     # A scan is named by its stem, such as that of a subject, unless another file shares it.

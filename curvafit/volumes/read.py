@@ -57,6 +57,8 @@ PARAMETERS = (*NAMES, "mass", *ORIENTATION)
 #: Readers of formats that can hold several arrays, by key.
 KEYED = (arrays.read_npz, arrays.read_hdf5, arrays.read_imaris, arrays.read_microscope)
 KEYED += (zarr.read_zarr, dicom.read_dicom)
+#: What to do with a slice that is a file.
+SLICED = ": put a scan's slices into a folder of their own, and name the folder"
 
 
 def load(
@@ -222,7 +224,8 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Stated]:
             return READERS[suffix]
     if shape_given:
         return arrays.read_raw
-    raise ScanError(f"a volume's name must end in one of {', '.join(READERS)}, got {path.name!r}")
+    hint = SLICED if path.suffix.lower() in tiff.SLICES else ""
+    raise ScanError(f"a volume's name must end in one of {', '.join(READERS)}, got {path.name!r}{hint}")
 
 
 def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
@@ -334,7 +337,7 @@ def _find_axes(
     if len(space) != 3 or len(long) != 3 + len(numbers) or 0 in shape:
         got = "no values" if 0 in shape else f"{len(long) - len(numbers)}D of shape {tuple(shape)}"
         hint = "; a channel, counted from 0, picks one volume of several" if (len(long), len(numbers)) == (4, 0) else ""
-        raise ScanError(f"a volume must be 3D, got {got} in {source}{hint}")
+        raise ScanError(f"a volume must be 3D, got {got} in {source}{SLICED if got[:2] == '2D' else hint}")
     if undecided := {name: shape[axis] for name, axis in others.items() if axis is not None and numbers[axis] is None}:
         content = " of ".join(f"{count} {name}s" for name, count in undecided.items())
         choices = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in undecided.items())

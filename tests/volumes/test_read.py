@@ -382,7 +382,8 @@ RECORDS = np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("ö", "i2")]))
 BARE = {"spacing": "abc"}, {"spacing": (1, 0, 1)}, {"spacing": (1, -1, 1)}, {"spacing": (1, 1)}, {"spacing": 0.0}
 BARE += ({"spacing": (1, 2, 3, 4)}, {"spacing": (1, float("nan"), 1)})
 REFUSED: list[tuple[str, Callable[[Path], object], dict, str]] = [
-    ("a.npy", npy(ramp((5, 6))), {}, "2D"), ("a.npy", npy(ramp((1, 5, 6))), {}, "2D"),
+    ("a.bmp", lambda path: path.write_bytes(b"BM"), {}, "must end.*a folder of their own"),
+    ("a.npy", npy(ramp((5, 6))), {}, "2D.*a folder of their own"), ("a.npy", npy(ramp((1, 5, 6))), {}, "2D"),
     ("a.npy", npy(ramp((2, 3, 4, 5))), {}, "4D"), ("a.npy", npy(np.zeros((0, 5, 6))), {}, "no values"),
     ("a.npy", npy(np.where(ramp() == 7, np.nan, ramp())), {}, "NaN"),
     ("a.npy", npy(np.where(ramp() < 2, np.inf, ramp())), {}, "infinite"),
