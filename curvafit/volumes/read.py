@@ -21,7 +21,7 @@ from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.core.files import is_url, is_zarr
 from curvafit.core.records import read_archive
 from curvafit.core.runtime import one_line
-from curvafit.core.units import common_unit, convert_length, format_length, is_unit, parse_unit
+from curvafit.core.units import METRES, common_unit, convert_length, format_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES
 from curvafit.volumes.formats import arrays, base, dicom, headers, meshes, nifti, tiff, zarr
 from curvafit.volumes.formats.base import ScanError, Stated
@@ -301,6 +301,8 @@ def to_volume(
         affine = base.affine_of(np.diag(edges[::-1]), (scale * origin)[::-1])
     notes = (*stated.gaps, *stated.notes, *axis_notes, *length_notes)
     notes += stated.guesses if spacing is None and unit is None else ()
+    if edge_unit in ("mm", "m") and (widest := float(max(edges * array.shape))) * METRES[edge_unit] > 1:
+        notes += (f"The scan would be {widest:.4g} {edge_unit} wide: is the voxel in µm?",)
     volume = Volume(array, tuple(edges.tolist()), edge_unit, affine, source, notes)
     if affine is not None and spacing is None:
         _check_angles(affine[:3, :3], source)

@@ -151,6 +151,13 @@ def test_tiff_states_its_spacing_in_many_ways(tmp_path: Path, options: dict, spa
     assert ["the file states" in note for note in given.notes] == [True] * (unit != "voxel")
 
 
+def test_a_scan_wider_than_a_metre_is_asked_for_its_unit(tmp_path: Path) -> None:
+    path = save(ramp(), tmp_path / "bone.npy")
+    for spacing, unit, wide in ((200.0, "mm", "1200 mm"), (0.5, "m", "3 m"), (166.0, "mm", ""), (1e5, "um", "")):
+        notes = [note for note in load(path, spacing=spacing, unit=unit).notes if "wide" in note]
+        assert notes == [f"The scan would be {wide} wide: is the voxel in µm?"] * bool(wide)
+
+
 def test_a_folder_of_slices_is_sorted_naturally_and_says_what_is_skipped(tmp_path: Path) -> None:
     for number, plane in enumerate(ramp((12, 5, 6), "uint8")):
         tifffile.imwrite(tmp_path / f"slice{number}.tif", plane, resolution=(1000, 1000), resolutionunit="CENTIMETER")
@@ -480,7 +487,7 @@ def test_values_spacing_and_unit_survive(suffix: str, dtype: str, shape, spacing
     assert np.array_equal(back.values, field.values)
     assert back.values.dtype == (np.uint8 if dtype == "bool" and suffix != ".zarr" else field.values.dtype)
     assert back.spacing == pytest.approx(spacing, rel=1e-6)
-    assert back.unit == unit and back.notes == ()
+    assert back.unit == unit and not [note for note in back.notes if "wide" not in note]
 
 
 def test_npy_keeps_values_only(tmp_path: Path) -> None:
