@@ -151,8 +151,9 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, s
 
 
 def _choose_shown(comparison: Comparison) -> list[str]:
-    """Return the symbols of the familiar numbers, and then of those that differ."""
-    symbols = dict.fromkeys((*OF_BODIES, *plot.FIRST_SHOWN, *(number.symbol for number in comparison.found)))
+    """Return the symbols of the number named beforehand, the familiar numbers, and then those that differ."""
+    primary = [comparison.primary.symbol] if comparison.primary else []
+    symbols = dict.fromkeys((*primary, *OF_BODIES, *plot.FIRST_SHOWN, *(each.symbol for each in comparison.found)))
     return [symbol for symbol in symbols if symbol in {number.symbol for number in comparison.numbers}]
 
 
@@ -279,10 +280,12 @@ def numbers_figure(comparison: Comparison, symbols: Sequence[str]) -> Figure:
 
 
 def _draw_legend(figure: Figure, c: Comparison) -> None:
-    things = "bodies" if c.of_bodies else "scans"
+    own = f"95 % interval of the subject's own {'bodies' if c.of_bodies else 'scans'}"
+    own += ", where known" * bool(np.isnan(c.halves).any())
     handles = [
+        Line2D([], [], linestyle="", label=f"bold: family-wise p ≤ {LEVEL:.2g}"),
         Line2D([], [], color=plot.QUIET, marker="o", linestyle="", markersize=4, label="a subject"),
-        Line2D([], [], color=plot.QUIET, linewidth=1.4, label=f"95 % interval of the subject's own {things}"),
+        Line2D([], [], color=plot.QUIET, linewidth=1.4, label=own),
         Line2D([], [], color=plot.INK, linewidth=1.4, label="mean of the group" if c.groups else "slope"),
     ]
     if c.of_bodies:
@@ -325,7 +328,8 @@ def _draw_panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure
         weight = "bold" if number.family <= LEVEL else "normal"
         axes.set_title(number.symbol + (f" ({unit})" if unit else ""), fontsize=11, fontweight=weight, pad=26)
         label = f"{comparison.effect} = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"
-        label += f"\nfamily-wise p = {format_number(number.family, 2)}"
+        named = "named beforehand; " * (number is comparison.primary)
+        label += f"\n{named}family-wise p = {format_number(number.family, 2)}"
         axes.annotate(label, (0.5, 1), (0, 3), "axes fraction", "offset points", ha="center", va="bottom", fontsize=7.5)
         axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.tick_params(length=2, labelsize=8)

@@ -247,6 +247,11 @@ def test_the_number_named_beforehand_leads_by_its_own_p() -> None:
     assert "diagrams are not told apart" in plain.status and named.verdict == "A and B differ by their thickness"
     assert named.verdict in named.status and named.verdict not in plain.status
     assert "thickness" in plain.status and "Tb.Th" in describe_methods(named)  # it differs most
+    figure = numbers_figure(named, ["Tb.Th", "BV/TV"])
+    marked = [[text.get_text() for text in axes.texts if "named beforehand" in text.get_text()] for axes in figure.axes]
+    assert [len(each) for each in marked] == [1, 0]
+    legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert "bold: family-wise p ≤ 0.05" in legend and "where known" not in legend
     with pytest.raises(ValueError, match="primary"):
         compare(scans[:4], scans[4:], primary="nothing")
 
