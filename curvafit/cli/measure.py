@@ -157,7 +157,10 @@ def _write_page(
         recorded |= {"maps": shown["maps"], "graph": shown["graph"]}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
         page = write_measures(results, folder, columns=columns, **traced, **settings)
-    say_notes(tuple(count_notes(results)))
+    if len(results) == 1:
+        _print_results([(results[0],)], labels=False)
+    else:
+        say_notes(tuple(count_notes(results)))
     say(str(page))
 
 
@@ -220,7 +223,15 @@ def _print_results(results: Sequence[tuple[Measures, ...]], labels: bool) -> Non
         compartments = list(of_scan[0].compartments.values()) or of_scan
         say_notes(dict.fromkeys(note for measures in compartments for note in measures.notes))
         for measures in compartments:
-            _print_measures(measures)
+            if measures.part is not None:
+                say(" ".join(map(str, measures.part)), style="bold")
+            rows = [
+                (quantity.name, quantity.symbol, *quantity.format(measures.unit)) for quantity in measures.quantities
+            ]
+            print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
+            z, y, x = measures.direction
+            if math.isfinite(z):
+                say(f"The surface is most nearly parallel to the direction {z:.2f}, {y:.2f}, {x:.2f} (z, y, x).")
 
 
 def _print_instances(instances: Sequence[Measures]) -> None:
@@ -237,13 +248,3 @@ def _print_instances(instances: Sequence[Measures]) -> None:
     cut = sum(instance["S.cut"].value > 0 for instance in instances)
     thin = sum(math.isnan(instance["H"].value) for instance in instances)
     say(f"{len(instances)} instances; {cut} are cut by the border, {thin} too thin for curvature.")
-
-
-def _print_measures(measures: Measures) -> None:
-    if measures.part is not None:
-        say(" ".join(map(str, measures.part)), style="bold")
-    rows = [(quantity.name, quantity.symbol, *quantity.format(measures.unit)) for quantity in measures.quantities]
-    print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
-    z, y, x = measures.direction
-    if math.isfinite(z):
-        say(f"The surface is most nearly parallel to the direction {z:.2f}, {y:.2f}, {x:.2f} (z, y, x).")

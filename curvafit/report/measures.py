@@ -26,7 +26,8 @@ from curvafit.report.page import (
     start_record,
     write_study,
 )
-from curvafit.scan.measures import QUANTITIES, Measures, Quantity, list_quantities
+from curvafit.scan.measures import QUANTITIES, Measures, list_quantities
+from curvafit.studies.comparison import FAMILIAR
 from curvafit.studies.scans import MEASURED, count_notes, list_rows, list_wide, write_measured
 from curvafit.studies.windowed import NAMES, Windows
 
@@ -81,7 +82,7 @@ def write_measures(
     target = check_measures(directory, overwrite=overwrite, command=command)
     measures = [scan.convert(measures[0].unit) for scan in measures]
     columns = columns or [{}] * len(measures)
-    unit, symbols = measures[0].unit, plot.FIRST_SHOWN
+    unit, symbols = measures[0].unit, [each[1] for each in QUANTITIES if each[1] in (*FAMILIAR, *plot.FIRST_SHOWN)]
     titles = list(dict.fromkeys(title for row in columns for title in row))
     # A scan without compartments has itself as the only one.
     compartments = [list(scan.compartments.values()) or [scan] for scan in measures]
@@ -111,7 +112,9 @@ def write_measures(
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
     lines = centreline.quantities if centreline else ()
-    page["branches"] = [(line.name, line.symbol, *_format_line(line, unit)) for line in lines]
+    # A count is whole, and has neither an interval nor a unit.
+    texts = [(f"{line.value:.0f}", "", "") if line.symbol.startswith("N.") else line.format(unit) for line in lines]
+    page["branches"] = [(line.name, line.symbol, *text) for line, text in zip(lines, texts, strict=True)]
     tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
     volumes = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items() if maps}
     more: dict[str, Callable[[Path], object]] = {MEASURED: partial(write_measured, measures, columns)}
@@ -120,13 +123,6 @@ def write_measures(
         tables["centreline.csv"] = list_quantities(centreline.source, unit, centreline.quantities)
         more |= {"centreline.swc": centreline.write_swc, "centreline.graphml": centreline.write_graphml}
     return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=volumes, more=more)
-
-
-def _format_line(quantity: Quantity, unit: str) -> tuple[str, str, str]:
-    """Return a number of a centreline, its interval and its unit as text; a count is whole and has none."""
-    if quantity.symbol.startswith("N."):
-        return f"{quantity.value:.0f}", "", ""
-    return quantity.format(unit)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------

@@ -53,7 +53,10 @@ def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) 
 
 
 def test_maps_lie_beside_the_page_of_one_scan(scans: list[Path], tmp_path: Path) -> None:
-    done("measure", scans[0], "--maps", "-o", tmp_path / "out")
+    said = done("measure", scans[0], "--maps", "-o", tmp_path / "out").stdout
+    page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    for symbol in ("Tb.Th.SD", "BS/BV", "BS/TV"):  # the table is on the page, and printed
+        assert symbol in said and f"{symbol}<" in page
     assert not (tmp_path / "out" / "numbers.svg").exists()  # of one scan the table is enough
     thickness = load(tmp_path / "out" / "thickness.nii.gz")
     assert thickness.spacing == pytest.approx(load(scans[0]).spacing) and thickness.unit == load(scans[0]).unit
