@@ -16,6 +16,7 @@ from PIL import Image
 
 from curvafit.geometry.mesh import surface
 from curvafit.priors.law import preset
+from curvafit.scan.tiles import measure
 
 pytestmark = pytest.mark.slow
 
@@ -166,3 +167,16 @@ def test_pictures_of_filling(script, monkeypatch: pytest.MonkeyPatch, tmp_path: 
     script("pictures").write_webp(tmp_path / "filled.webp", tmp_path / "small.webp", width=130)
     with Image.open(tmp_path / "small.webp") as small, Image.open(tmp_path / "filled.webp") as large:
         assert small.size == (130, round(130 * large.height / large.width)) and small.format == "WEBP"
+
+
+def test_bone(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two groups that measure as their laws do, scanned alike, and the picture of the page."""
+    bone = script("bone")
+    monkeypatch.setattr(bone, "GROUPS", {name: (law, animals[:2]) for name, (law, animals) in bone.GROUPS.items()})
+    words = ["bone", "--edge", "40", "--picture", str(tmp_path / "bone.webp"), "-o", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    bone.main()
+    scans = [measure(tmp_path / group / f"mouse{k}.tif") for group, k in (("control", 1), ("treated", 5))]
+    assert scans[0]["BV/TV"].value > scans[1]["BV/TV"].value > 0.1 and scans[0].unit == "mm"
+    with Image.open(tmp_path / "bone.webp") as picture:
+        assert picture.width == 1000
