@@ -85,7 +85,7 @@ class Quantity:
         return format_number(self.value, 4), half, power_name(unit, self.power)
 
 
-#: Name, symbol and power of each quantity, and how it comes from sums.
+#: Name, symbol, power of quantities, and how they come from sums; of a whole scan `measure_connectivity` has χ, Conn.D.
 QUANTITIES: tuple[Formula, ...] = (
     ("volume fraction", "BV/TV", 0, lambda s: s["inside"] / s["volume"]),
     ("thickness", "Tb.Th", 1, lambda s: s["thickness"] / s["inside"]),
