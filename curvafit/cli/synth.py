@@ -87,7 +87,7 @@ def synth(
             raise ValueError("--unit needs --spacing or --voxel")
         reading["unit"] = None  # it is that of --voxel, not of --like
     source, laws = shapes
-    modality = _choose_modality(**imaging, reading=reading)
+    modality, mask = _choose_modality(**imaging, reading=reading)
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
     from curvafit.data_synth import sets
@@ -106,14 +106,15 @@ def synth(
         sets.build_set(out, spec, count, progress, workers=workers, command=command_line())
     if (total := len(sets.list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
+    say_notes(sets.describe_set(out, mask))
     for path in (out / "dataset.json", sets.write_preview(out)):
         say(str(path))
 
 
 def _choose_modality(
     name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
-) -> Modality:
-    """Return the modality of a name, or one fitted to the scan `like`.
+) -> tuple[Modality, Any]:
+    """Return the modality of a name, or one fitted to the scan `like`, and that scan's mask if there is one.
 
     If `visible` is given, masks end where less than this share of the structure's light arrives.
     """
@@ -125,22 +126,22 @@ def _choose_modality(
                 raise ValueError(f"--{option.replace('_', '-')} needs --like")
         from curvafit.data_synth.imaging.modality import modality as named_modality
 
-        modality = named_modality(str(name))
+        modality, inside = named_modality(str(name)), None
     else:
-        modality = _fit_to_scan(like, mask, reading)
+        modality, inside = _fit_to_scan(like, mask, reading)
     if visible is None:
-        return modality
+        return modality, inside
     from curvafit.data_synth.imaging.modality import annotator_threshold
 
     share = annotator_threshold(modality.base) if visible == "auto" else parse_numbers(visible, "--visible", 1)[0]
-    return replace(modality, base=replace(modality.base, visible=share))
+    return replace(modality, base=replace(modality.base, visible=share)), inside
 
 
-def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> Modality:
-    """Return a modality fitted to a scan, by a mask of two values if there is one."""
+def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> tuple[Modality, Any]:
+    """Return a modality fitted to a scan, by a mask of two values if there is one, and the middle of that mask."""
     import numpy as np
 
-    from curvafit.data_synth.imaging.like import fit_modality
+    from curvafit.data_synth.imaging.like import crop_middle, fit_modality
     from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
@@ -148,8 +149,9 @@ def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> Modali
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
     if mask is None:
-        return fit_modality(scan, None)
+        return fit_modality(scan), None
     values = load(mask, **{name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}).values
     if (count := len(np.unique(values))) != 2:
         raise ValueError(f"--like-mask must have two values, got {count}: choose one with --label")
-    return fit_modality(scan, values > values.min())
+    inside = values > values.min()
+    return fit_modality(scan, inside), crop_middle(scan, inside)[1]

@@ -18,6 +18,7 @@ from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, hold_signals, silent
+from curvafit.core.units import unit_name
 from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.dataset import Case, Recipe
@@ -25,6 +26,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.store import check_same
 from curvafit.drawing.plot import grey_limits, make_figure, section_on, write_picture
 from curvafit.geometry.centreline import centreline, write_graphml
+from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import Grid
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
@@ -125,9 +127,8 @@ def build_set(
         _write_list(folder, spec)
 
 
-def make_case(folder: str | Path, index: int) -> int:
+def make_case(folder: Path, index: int) -> int:
     """Make a case of a set, a worker's part of `build_set`, and return its index; one that fails leaves no file."""
-    folder = Path(folder)
     spec = read_spec(folder)
     try:
         _write_case(folder, spec, index, spec.recipe.case(index))
@@ -221,10 +222,26 @@ def _measure_labels(case: Case, parts: Sequence[str]) -> dict[str, Any]:
     return {part: labels[part] for part in parts}
 
 
-def write_preview(folder: str | Path) -> Path:
+def describe_set(folder: Path, mask: np.ndarray | None = None) -> list[str]:
+    """Return notes on a set: how many shapes had not come to rest; and, of its first labels beside a mask (Z, Y, X) on
+    voxels of the same edges, how thick the structure is and how much of the volume it fills."""
+    spec, names = read_spec(folder), list(map(case_name, list_cases(folder)))
+    records = [json.loads((folder / RECORDS / f"{name}.json").read_text("utf-8")) for name in names]
+    moving = sum(record["source"].get("status", "").startswith("still moving") for record in records)
+    notes = [f"{moving} of {len(names)} shapes had not come to rest"] if moving else []
+    if mask is None:
+        return notes
+    label, base, figures = LAYOUTS[spec.layout].label, spec.recipe.modality.base, []
+    for masks in ([load(folder / label.format(case=name)).values > 0 for name in names[:SHOWN]], [mask]):
+        thickness = np.concatenate([local_thickness(inside, base.spacing)[inside] for inside in masks]).mean()
+        figures += [f"{thickness:.2g}", f"{100 * np.mean([inside.mean() for inside in masks]):.1f} %"]
+    thick, share, *yours = figures
+    return [*notes, f"labels: {thick} {unit_name(base.unit, 2)} thick, {share} inside; your mask: {', '.join(yours)}"]
+
+
+def write_preview(folder: Path) -> Path:
     """Write `preview.png` into a set's folder. It shows the first cases, each by the slice with most of the structure,
     without and with the label's outline."""
-    folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
     columns, rows = min(ROW, len(names)), -(-len(names) // ROW)

@@ -64,7 +64,9 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
     (tmp_path / "fit.json").write_text(json.dumps(fit | {"morphometry": {"volume_fraction": 0.2}}))
     out, told = tmp_path / "set", ["--prior", tmp_path / "fit.json", "--like", tmp_path / "scan.nii.gz", "--label", "1"]
     told += ["--like-mask", tmp_path / "mask.nii.gz", "--visible", "auto", "--voxel", "1", "--unit", "um"]
-    made(out, *told, "--count", "1", "--shape", "8,16,16", "--workers", "0")  # the unit is of the shape's voxel alone
+    # the unit is of the shape's voxel alone
+    ended = made(out, *told, "--count", "1", "--shape", "8,16,16", "--workers", "0")
+    assert "mm thick, " in ended.stderr and f"{100 * inside.mean():.1f} %\n" in ended.stderr
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
     assert image.spacing == pytest.approx(edges) and image.unit == "mm"
     record = json.loads((out / "cases" / "case_00000.json").read_text())
@@ -75,7 +77,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
 #: What is typed (FIT, STORE, MASK, TAKEN and NONE are files and folders), and a word of what is said of it.
 REFUSALS = {
     "--modality confocal": {
-        "--atlas NONE": "none", "": "--prior", "--prior tube": "preset", "--presets tubes --voxel 0.001": "1e+09",
+        "--atlas NONE": "none", "": "--prior", "--prior tube": "--prior", "--presets tubes --voxel 0.001": "1e+09",
         "--presets tubes --volume-fraction 2": "volume fraction",
         "-o TAKEN --presets tubes": "folder",
     },

@@ -15,7 +15,7 @@ from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
 from curvafit.data_synth import sets
-from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
+from curvafit.data_synth.sets import SetSpec, build_set, describe_set, make_case, read_spec
 from curvafit.volumes.read import load
 
 
@@ -49,6 +49,24 @@ def test_a_layout_holds_the_cases(tmp_path, order, layout):
     record = json.loads((folder / "cases" / "case_00001.json").read_text())
     assert record["imaging"]["contrast"]["foreground"] == case.record["imaging"]["contrast"]["foreground"]
     assert set(record["source"]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
+
+
+def test_a_set_is_described_beside_a_mask(tmp_path, order):
+    """Its own label is as thick and fills as much; a plate of four layers of 1 um is 4 um thick."""
+    folder = build_set(tmp_path / "set", order, 1)
+    label = load(folder / "labelsTr" / "case_00000.nii.gz").values > 0
+    (same,) = describe_set(folder, label)
+    labels, _, mask = same.partition("; your mask: ")
+    assert labels.removeprefix("labels: ").replace(" µm thick", "").removesuffix(" inside") == mask
+    assert mask.endswith(f", {100 * label.mean():.1f} %")
+    plate = np.zeros((12, 16, 16), bool)
+    plate[4:8] = True
+    assert describe_set(folder, plate)[0].endswith("; your mask: 4, 33.3 %")
+    record = folder / "cases" / "case_00000.json"
+    content = json.loads(record.read_text())
+    content["source"]["status"] = "still moving after 9 steps: the energy fell by 3 % over the last tenth"
+    record.write_text(json.dumps(content))
+    assert describe_set(folder) == ["1 of 1 shapes had not come to rest"]
 
 
 def test_a_set_goes_on_and_ends_the_same(tmp_path, order):

@@ -54,7 +54,7 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     The mask is the structure's voxels, (Z, Y, X); by default what is bright. The modality's `base` holds the estimates,
     its `ranges` their surroundings (`SPREAD`), and its `voxel` is the finest edge of the scan's.
     """
-    values, cropped_mask = _crop_middle(scan, mask)
+    values, cropped_mask = crop_middle(scan, mask)
     edges = np.array(scan.spacing)
     inside = _find_bright(values, edges) if cropped_mask is None else cropped_mask
     if not inside.any() or inside.all():
@@ -98,7 +98,7 @@ def _to_imaging(scan: Volume, background: Background, structure: Structure, nois
     )
 
 
-def _crop_middle(scan: Volume, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def crop_middle(scan: Volume, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Check a scan and its mask; return the middle of both, of at most `MOST` voxels."""
     if min(scan.shape) < 8:
         raise ValueError(f"the scan must have at least 8 voxels along each axis, got {scan.shape}")
