@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -96,6 +97,8 @@ class Generated:
         """
         sources = tuple(laws)
         parsed = read_laws(sources)
+        for doubt in filter(None, (law.doubt for law in parsed)):
+            warnings.warn(doubt, stacklevel=2)
         fractions = {law.volume_fraction for law in parsed}
         if fraction is None and len(fractions) == 1:
             (fraction,) = fractions

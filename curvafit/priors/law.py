@@ -109,11 +109,10 @@ class Law:
 
     @property
     def doubt(self) -> str:
-        """A sentence of warning where the fit's status is not `Supported`; else empty."""
+        """A warning where the fit's status is not `Supported`, with that status; else empty."""
         if not self.status or self.status.startswith("Supported"):
             return ""
-        state = "was not tested" if self.status.startswith("Not tested") else "is not `Supported`"
-        return f"The law ({self.origin}) is of a fit that {state}: it may not be that of its scan."
+        return f"The law ({self.origin}) may not be that of its scan: its fit is not `Supported`. {self.status}"
 
     @property
     def fitted(self) -> bool:

@@ -21,7 +21,7 @@ from curvafit.data_synth import dataset as training
 from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai
 from curvafit.data_synth.imaging.effects import occupancy
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, Noise, Optics
-from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic
+from curvafit.data_synth.sources import Generated, apply_symmetry, choose_voxel, crop_periodic
 from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
 from curvafit.volumes import Volume, save
@@ -162,6 +162,12 @@ def test_shapes_of_laws():
     kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))
     assert choose_voxel([in_um], kind) == choose_voxel([in_voxels], of_voxels) == 0.25
     assert choose_voxel([in_voxels], kind) == 0.5
+
+
+def test_a_fit_in_doubt_is_repeated_with_its_status():
+    doubtful = dataclasses.replace(made_fit(), status="Not tested (nearest match): no shape was grown (p = 0.025).")
+    with pytest.warns(UserWarning, match=r"not `Supported`. Not tested .* \(p = 0.025\)"):
+        Generated.of([doubtful])
 
 
 @pytest.mark.slow
