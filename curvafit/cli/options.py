@@ -28,7 +28,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 #: Parameters of commands that are volumes to read; those that are laws, each with the name of its option.
 _VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
             "like_mask", "start")  # fmt: skip
-_LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
+_LAWS = {"preset": "--preset", "prior": "--prior", "laws": "--prior (or --preset)"}
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------
@@ -83,15 +83,14 @@ def _check_inputs(values: Mapping[str, Any]) -> None:
             file = path.rpartition("::")[0] or path  # without the key of an array, as in file.h5::key
             if not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
                 raise FileNotFoundError(f"no such file: {file}")
-    from curvafit.core.checks import quoted, simplify_name
-    from curvafit.priors.published import PUBLISHED
+    from curvafit.core.checks import simplify_name
+    from curvafit.priors.published import PUBLISHED, no_law
 
     for parameter, option in _LAWS.items():
         text = values.get(parameter)  # laws between commas, or a file, which may have a comma in its name
         for law in [] if text is None or text.endswith(".json") else text.split(","):
             if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(str(text)):
-                presets = ", ".join(PUBLISHED)
-                raise ValueError(f"--{option} takes a preset among {presets}, or a fit.json, got {quoted(law)}")
+                raise no_law(law, f"{option} takes")
 
 
 def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:

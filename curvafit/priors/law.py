@@ -18,7 +18,7 @@ from curvafit.core.schema import Rule, decode
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.published import PUBLISHED
+from curvafit.priors.published import PUBLISHED, no_law
 
 Content = TypeVar("Content")
 #: The format of a `fit.json`.
@@ -81,7 +81,7 @@ class Law:
         if (name := preset_name(law)) is not None:
             return PRESETS[name]
         if isinstance(law, str) and not (law.endswith(".json") or os.path.isfile(law)):
-            raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {quoted(law)}")
+            raise no_law(law)
         if isinstance(law, (str, PathLike)):
             return cls.load(law)
         if isinstance(law, HasLaw):
@@ -272,8 +272,7 @@ def preset(name: str) -> Law:
     Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`. Raises
     ValueError where the name is not in `PRESETS`.
     """
-    key = preset_name(name)
-    if key is None:
+    if (key := preset_name(name)) is None:
         raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {quoted(name)}")
     return PRESETS[key]
 

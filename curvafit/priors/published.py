@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from difflib import get_close_matches
+
+from curvafit.core.checks import quoted, simplify_name
+
 _GALLERY = "curvatubes results/gallery"
 _TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
 PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
@@ -41,3 +46,11 @@ PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
     "spatial-3": ((2, 2, 2, -75, -75, 937.5), -0.7, _TABLE_4),
     "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
 }
+
+
+def no_law(text: str, expected: str = "expected") -> ValueError:
+    """Return the error of a text that is neither the name of a preset nor a file, with what may be meant."""
+    fit = os.path.join(text, "fit.json")
+    meant = [fit] if os.path.isfile(fit) else get_close_matches(simplify_name(text), PUBLISHED, 1)
+    presets, hint = ("", f": did you mean {meant[0]}?") if meant else (f" among {', '.join(PUBLISHED)},", "")
+    return ValueError(f"{expected} a preset{presets} or a fit.json, got {quoted(text)}{hint}")

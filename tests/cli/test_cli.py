@@ -40,7 +40,8 @@ REFUSALS: dict[str, dict[str, str]] = {
     "generate -o out.npy": {
         f"{' '.join(LAW[:2])} --volume-fraction nan": "volume fraction",
         "--coefficients 1e300,0,1e300,0,0,0 --mass 0": "a20", f"--preset {'x' * 5000}": "preset",
-        "--preset tu\nbes\x1b[31m\u202e": r"\x1b[31m\u202e", "": "--preset", "--preset tube": "bilayers",
+        "--preset tu\nbes\x1b[31m\u202e": r"\x1b[31m\u202e", "": "--preset", "--preset other": "bilayers",
+        "--preset tube": "did you mean tubes?",
         f"{' '.join(LAW[:2])}": "mass", f"{' '.join(LAW[:2])} --mass -1.5": "mass",
         "--coefficients 1,2,6 --mass -0.6": "--coefficients",
         "--coefficients 1,2,6,-40,nan,400 --mass 0": "--coefficients",

@@ -220,7 +220,7 @@ def test_inputs_are_refused_before_libraries(tmp_path: Path) -> None:
     refusals = {
         "measure typo.tif": "no such file: typo.tif",
         "reconstruct typo.h5::a -o a.tif": "no such file: typo.h5",
-        "generate --preset tubez -o a.tif": "takes a preset among",
+        "generate --preset tubez -o a.tif": "--preset takes a preset or a fit.json, got 'tubez': did you mean tubes?",
         "synth --presets tubes,spunge --modality confocal -o set": "got 'spunge'",
     }
     run = subprocess.run([sys.executable, "-c", code, *refusals], cwd=tmp_path, capture_output=True, text=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -89,6 +90,14 @@ def test_a_law_needs_little_of_the_file(tmp_path: Path) -> None:
         path.write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=word):
             Law.load(path)
+
+
+def test_a_text_that_is_no_law_is_met_with_what_may_be_meant(fit_path: Path) -> None:
+    for text, meant in (("tube", "tubes"), (str(fit_path.parent), str(fit_path))):
+        with pytest.raises(ValueError, match=re.escape(f"did you mean {meant}?")):
+            Law.of(text)
+    with pytest.raises(ValueError, match="bilayers"):
+        Law.of("nothing of the kind")
 
 
 def test_several_laws_are_read_in_order(fit_path: Path) -> None:
