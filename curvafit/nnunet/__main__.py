@@ -8,10 +8,9 @@ if __name__ == "__main__":  # nnU-Net imports each file of the folder
     from curvafit.priors.law import Law, preset_name
 
     try:
-        (prior,) = sys.argv[1:]
-        Law.of(prior).in_unit("mm")  # the unit of nnU-Net's lengths
+        Law.of(prior := " ".join(sys.argv[1:])).in_unit("mm")  # the unit of nnU-Net's lengths
     except (ValueError, OSError) as error:
-        print(f"error: expected one prior, a preset or a fit.json with a unit: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     print(
         f"export nnUNet_extTrainer={shlex.quote(str(Path(__file__).parent))}${{nnUNet_extTrainer:+:$nnUNet_extTrainer}}"

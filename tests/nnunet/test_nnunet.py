@@ -97,7 +97,8 @@ def test_a_shell_takes_the_variables_that_are_printed():
         assert said.stdout == f"{FOLDER}{rest}|bilinear-tubes\n"
     for words in ((), ("tubs",), ("none.json",)):
         done = variables(*words)
-        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "prior" in done.stderr and not done.stdout
+        assert done.returncode == 2 and done.stderr.count("\n") == done.stderr.count("expected") == 1
+        assert "fit.json" in done.stderr and not done.stdout
 
 
 @pytest.mark.skipif(
