@@ -59,6 +59,11 @@ def check_float(
     return number
 
 
+def check_positive(value: Any, expected: str, *, of: Any = None) -> float:
+    """Return a positive number, such as a length in any unit, whose cube float32 holds, or raise ValueError."""
+    return check_float(value, expected, SHORTEST, LONGEST, of=of)
+
+
 def check_open_interval(value: Any, expected: str, low: float, high: float) -> float:
     """Return a number above `low` and below `high` as a float, or raise ValueError."""
     number = check_float(value, expected)

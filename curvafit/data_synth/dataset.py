@@ -15,17 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.core.checks import (
-    LONGEST,
-    SHORTEST,
-    as_tuple,
-    check_choice,
-    check_float,
-    check_int,
-    check_seed,
-    check_type,
-    quoted,
-)
+from curvafit.core.checks import as_tuple, check_choice, check_int, check_positive, check_seed, check_type, quoted
 from curvafit.core.runtime import Progress, show_share
 from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
@@ -82,17 +72,16 @@ class Recipe:
         expected = "3 whole numbers of voxels above 0 (z, y, x)"
         shape = tuple(check_int(n, expected, 1, MOST, of=self.shape) for n in as_tuple(self.shape, expected, 3))
         object.__setattr__(self, "shape", shape)
-        voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        object.__setattr__(self, "voxel", voxel)
+        object.__setattr__(self, "voxel", check_positive(self.voxel, "a shape's voxel of positive length"))
         object.__setattr__(self, "seed", check_seed(self.seed))
         expected = "calibres as two positive factors, the lower first"
         calibres = as_tuple(self.calibres, expected, 2)
-        low, high = (check_float(n, expected, 1e-3, 1e3, of=calibres) for n in calibres)
+        low, high = (check_positive(n, expected, of=calibres) for n in calibres)
         if low > high:
             raise ValueError(f"expected {expected}, got {quoted(calibres)}")
         object.__setattr__(self, "calibres", (low, high))
         for calibre in self.calibres:
-            check_crop(self.source.edge, self.shape, voxel * calibre, self.modality)
+            check_crop(self.source.edge, self.shape, self.voxel * calibre, self.modality)
 
     @property
     def largest(self) -> tuple[int, int, int]:

@@ -15,7 +15,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_type
+from curvafit.core.checks import check_positive, check_type
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import hold_signals
@@ -50,7 +50,7 @@ class Output:
         check_type(self.unit, str, "a unit as text")
         unit, factor = parse_unit(self.unit)
         object.__setattr__(self, "unit", unit)
-        edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
+        edge = check_positive(self.voxel, "a positive voxel edge")
         object.__setattr__(self, "voxel", edge * factor)
 
 

@@ -12,7 +12,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
+from curvafit.core.checks import check_choice, check_positive, check_type
 from curvafit.core.runtime import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.curvature import XI, diffuse_curvatures, jet
@@ -178,7 +178,7 @@ def diagram(
     check_choice(curvature, ("geometric", "diffuse"), "curvature 'geometric' or 'diffuse'")
     check_type(grid, Grid, "a Grid")
     check_type(u, (np.ndarray, Tensor), f"a field of shape {grid.shape}")
-    epsilon = check_float(epsilon, "a positive epsilon", SHORTEST, LONGEST)
+    epsilon = check_positive(epsilon, "a positive epsilon")
     if where is not None and np.shape(where) != grid.shape:
         raise ValueError(f"expected a mask of shape {grid.shape}, got {np.shape(where)}")
     values = torch.as_tensor(u)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted
+from curvafit.core.checks import check_float, check_positive, quoted
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
@@ -71,7 +71,7 @@ class Coefficients:
         The linear part is multiplied by `unit`, the constant one by its square. Working units become physical ones by
         `in_unit(0.01 / working voxel)`.
         """
-        unit = check_float(unit, "a positive length unit", SHORTEST, LONGEST)
+        unit = check_positive(unit, "a positive length unit")
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_int
+from curvafit.core.checks import check_choice, check_int, check_positive
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -55,7 +55,7 @@ class Grid:
     def __post_init__(self) -> None:
         counts, edges = "a shape of 3 whole numbers, each at least 4", "a spacing of 3 positive numbers (z, y, x)"
         shape = tuple(check_int(n, counts, 4, MOST, of=self.shape) for n in _triple(self.shape))
-        spacing = tuple(check_float(h, edges, SHORTEST, LONGEST, of=self.spacing) for h in _triple(self.spacing))
+        spacing = tuple(check_positive(h, edges, of=self.spacing) for h in _triple(self.spacing))
         check_choice(self.boundary, ("periodic", "replicate"), "boundary 'periodic' or 'replicate'")
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", spacing)

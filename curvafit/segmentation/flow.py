@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
+from curvafit.core.checks import check_float, check_int, check_positive
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import unit_name
 from curvafit.core.workers import Cluster
@@ -128,7 +128,7 @@ def choose_epsilon(scan: Volume, epsilon: float | None) -> float:
     """Return ε, by default twice the smallest voxel edge; raise ValueError where it is not positive."""
     if epsilon is None:
         return RESOLVED * min(scan.spacing)
-    return check_float(epsilon, f"a positive epsilon in {unit_name(scan.unit)}", SHORTEST, LONGEST)
+    return check_positive(epsilon, f"a positive epsilon in {unit_name(scan.unit)}")
 
 
 @dataclass(frozen=True)

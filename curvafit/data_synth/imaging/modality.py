@@ -13,16 +13,7 @@ import numpy as np
 import torch
 import yaml
 
-from curvafit.core.checks import (
-    LONGEST,
-    SHORTEST,
-    check_choice,
-    check_float,
-    check_seed,
-    check_type,
-    quoted,
-    simplify_name,
-)
+from curvafit.core.checks import check_choice, check_positive, check_seed, check_type, quoted, simplify_name
 from curvafit.core.schema import Rule, decode
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging import effects
@@ -186,7 +177,7 @@ class Modality:
     ranges: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        check_positive(self.voxel, "a shape's voxel of positive length")
         ranges = {
             name: tuple(attrgetter(name)(self.base.assign({name: end})) for end in ends)
             for name, ends in self.ranges.items()
@@ -217,8 +208,7 @@ MODALITIES = {name: decode(Modality, {"name": name, **part}) for name, part in _
 def modality(name: str) -> Modality:
     """Return the preset of a name; capitals, spaces and underscores do not matter: `Two_Photon` is `two-photon`."""
     plain = simplify_name(str(name))
-    if plain not in MODALITIES:
-        raise ValueError(f"a modality is one of {', '.join(MODALITIES)}, got {quoted(name)}")
+    check_choice(plain, MODALITIES, f"a modality among {', '.join(MODALITIES)}")
     return MODALITIES[plain]
 
 
