@@ -43,7 +43,8 @@ const wide = document.documentElement.scrollWidth - window.innerWidth;
 const faults = wide > 1 ? [`${wide} pixels wider than the window`] : [];
 for (const image of document.images) if (image.src && !image.naturalWidth) faults.push(`no picture ${image.src}`);
 for (const image of document.images) if (!image.hasAttribute("alt")) faults.push(`no words for ${image.src}`);
-for (const frame of document.querySelectorAll("iframe:not([title])")) faults.push(`no title ${frame.src}`);
+const frames = [...document.querySelectorAll("iframe:not([title])")].filter(seen);
+for (const frame of frames) faults.push(`no title ${frame.src}`);
 const content = document.querySelector("article") || document.body;
 for (const each of content.querySelectorAll("a[href], button, input, select")) {
   if (seen(each) && !name(each)) faults.push(`no name: ${each.outerHTML.slice(0, 80)}`);
