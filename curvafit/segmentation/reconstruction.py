@@ -148,9 +148,20 @@ def reconstruct(
     volume = load(slices, **reading, lazy=True)
     which = {"every": every, "known": known, "ignore": ignore, "axis": axis}
     check_which(volume.shape, **which, suggest=suggest)  # type: ignore[arg-type]
+    options = {"image": image, "example": example, "suggest": suggest, "working": working, "progress": progress}
+    return fill_volume(volume, which, prior, reading=reading, **options)  # type: ignore[arg-type]
+
+
+def fill_volume(
+    volume: Volume, which: dict[str, Any], prior: LawLike | None, *, image: Source | None = None,
+    example: Source | None = None, suggest: int = 0, working: Working, progress: Progress = silent,
+    reading: dict[str, Any], larger: Known | None = None,
+) -> Segmentation:  # fmt: skip
+    """Fill a volume as `reconstruct` does, with the options `which` of its known slices. Of the box of a `larger`
+    volume, the shares and the numbers of slices that the result states are those of the larger one."""
     inputs = _Inputs.load(volume, which, prior, image, example, working=working, reading=reading)
     with inputs.open_run(working, progress) as run:
-        return _fill_between(inputs, suggest, run, working, progress)
+        return _fill_between(inputs, suggest, run, working, progress, larger)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +209,14 @@ class _Inputs:
         return open_run(crew, working.store, identity, progress, _ENDS)
 
 
-def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, progress: Progress) -> Segmentation:
+def _fill_between(
+    inputs: _Inputs, suggest: int, run: Run, working: Working, progress: Progress, larger: Known | None
+) -> Segmentation:
     """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is."""
     volume = inputs.volume
     known = Known.find(volume, run, **inputs.which)
+    whole = larger or known
+    part = math.prod(volume.shape) / math.prod(whole.volume.shape)
     slices, labels = known.read(run)
     notes = (*known.notes, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
     example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
@@ -214,17 +229,18 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     trial, task, head = _try_law(engine, slices, inputs.law, example, strength, len(tiles))
     if grid is None or trial.law is None:
         filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks), None
-        inside = flow_summary(filled.share)
+        inside = flow_summary(part * filled.share)
     else:
         problem = SlicesProblem(trial, slices, engine.level(slices))
         lowered = lower_volume(problem, grid, tiles, working=working, progress=progress)
         filled, engine = _weigh_evidence(engine, trial, task, known, slices, lowered)
         phase, notes = known.turn_back(lowered.phase), (*notes, *grid.notes)
-        inside = flow_summary(float(lowered.mask.mean()), lowered.energies, lowered.steps)
-    uncertain = filled.judge(known, slices, engine, suggest)
+        inside = flow_summary(part * float(lowered.mask.mean()), lowered.energies, lowered.steps)
+    uncertain = filled.judge(known, slices, engine, suggest, part)
     tested = "the example" if example else "slices left out" if trial.law else "generated shapes"
     options = {"tested": tested, "image": evidence is not None}
-    status, doubts = describe_filled(head, inside, filled.share, uncertain, known.places, slices.length, **options)
+    length = whole.volume.shape[whole.axis]
+    status, doubts = describe_filled(head, inside, part * filled.share, uncertain, whole.places, length, **options)
     return Segmentation.of(
         volume, filled.mask, phase, trial.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
         weight=None, status=status, uncertainty=uncertain, image=inputs.image,
@@ -355,18 +371,19 @@ class _Filled:
         """The mask's fraction of the volume."""
         return float(self.sums["inside"] / math.prod(self.mask.shape))
 
-    def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
-        """Return how sure the volume is, and which slices to annotate next."""
+    def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int, part: float) -> Uncertainty:
+        """Return how sure the volume is, `part` of the one whose shares are stated, and which slices to annotate."""
         sums, whole = self.sums, engine.evidence is not None
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
+        shares = share_by_slices(slices.areas, slices.places, slices.length, whole=whole)
         order = axis_first((0, 1, 2), known.axis)  # the volume's axes in the order of the sums
         return Uncertainty(
             replace(known.volume, array=self.likely, notes=()),
             engine.taught.error,
             suggest_slices(sums["along 0"], slices.places, suggest),
             dice,
-            known_share=share_by_slices(slices.areas, slices.places, slices.length, whole=whole),
-            mean_probability=float(sums["total"]) / math.prod(slices.shape),
+            known_share=tuple(part * share for share in shares),
+            mean_probability=part * float(sums["total"]) / math.prod(slices.shape),
             entropies=tuple(sums[f"along {order.index(axis)}"] for axis in range(3)),
         )
 

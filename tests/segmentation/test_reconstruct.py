@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import nibabel
@@ -278,6 +279,21 @@ def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
     labels[:, 45:], labels[8:, :, 40:], labels[8:, :10, :10] = 2, 3, 3
     found = reconstruct_labels(labels, known=[0, 16]).labels
     assert found is not None and set(np.unique(found.values)) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("law", [None, WILLMORE])
+def test_what_is_said_of_a_label_is_of_the_volume_and_not_of_its_box(law: Coefficients | None) -> None:
+    """A label that is filled in a box of 37 slices is reported as of all 65."""
+    z, y, x = np.indices((65, 96, 80))
+    body = np.sqrt((z - 20) ** 2 + (y - 22) ** 2 + (x - 22) ** 2) < 12
+    labels = np.where(body, 1, 2 * (np.hypot(z - 40, y - 60) < 9)).astype(np.uint8)
+    found = reconstruct_labels(labels, law, every=4, **QUICK)
+    said = found.status.partition("; label 2: ")[0]
+    assert "17 of 65 slices known" in said
+    mask, slices = (float(number) for number in re.findall(r"([\d.]+) %(?= of the| \()", said))
+    assert mask == pytest.approx(100 * (found.labels.values == 1).mean(), abs=0.006)  # type: ignore[union-attr]
+    areas = body.mean((1, 2))  # which are joined by straight lines
+    assert slices == pytest.approx(100 * np.interp(range(65), range(0, 65, 4), areas[::4]).mean(), abs=0.006)
 
 
 def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
