@@ -200,6 +200,7 @@ def _join_labels(
     entropy = doubt(likely)
     entropies = tuple(entropy.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
     suggestions = suggest_slices(entropies[known.axis], places, inputs.suggest)
+    entropies[known.axis][~mark_between(places, len(unfilled))] = 0
     table = np.array([0, *labels], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
     if (kind := smallest_type(table)).itemsize < 8:  # labels of 64 bits keep their type
         table = table.astype(kind)

@@ -376,6 +376,7 @@ class _Filled:
         sums, whole = self.sums, engine.evidence is not None
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
         shares = share_by_slices(slices.areas, slices.places, slices.length, whole=whole)
+        entropies = sums["along 0"] * slices.between, sums["along 1"], sums["along 2"]
         order = axis_first((0, 1, 2), known.axis)  # the volume's axes in the order of the sums
         return Uncertainty(
             replace(known.volume, array=self.likely, notes=()),
@@ -384,7 +385,7 @@ class _Filled:
             dice,
             known_share=tuple(part * share for share in shares),
             mean_probability=part * float(sums["total"]) / math.prod(slices.shape),
-            entropies=tuple(sums[f"along {order.index(axis)}"] for axis in range(3)),
+            entropies=tuple(entropies[order.index(axis)] for axis in range(3)),
         )
 
 

@@ -66,7 +66,7 @@ class Uncertainty:
     mean_probability
         Of one structure: its share of the volume by the probabilities, 0 in slices that are not filled.
     entropies
-        The sums of the entropies of probabilities, in nats, over the slices across z, y and x.
+        The sums of the entropies of probabilities, in nats, over the slices across z, y and x; 0 beyond the known ones.
     """
 
     probability: Volume

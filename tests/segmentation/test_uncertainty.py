@@ -1,11 +1,14 @@
 """Probabilities between known slices, how well they are calibrated, and the slices to annotate next."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from annotated import ball
 from scipy.ndimage import gaussian_filter
 
 import curvafit.segmentation.uncertainty as room
+from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import harmonic_distance
 from curvafit.segmentation.uncertainty import calibration_error, probability
@@ -155,6 +158,15 @@ def test_each_suggestion_lowers_the_entropy() -> None:
         others = [room.remaining_entropy(left, places, n).sum() for n in range(40) if n not in places]
         assert after.sum() == min(others)
         left, places = after, [*places, new]
+
+
+@pytest.mark.parametrize("fill", [reconstruct, reconstruct_labels])
+def test_the_least_certain_slices_lie_between_known_ones(fill: Callable) -> None:
+    """A ball's slices beyond the last known one are guesses, but no slice to look at."""
+    found = fill(ball(33).astype(np.uint8), known=[8, 16, 24]).uncertainty
+    beyond = found.probability.values[25:]
+    assert ((beyond > 0.1) & (beyond < 0.9)).any()
+    assert found.entropies[0].nonzero()[0].tolist() == [*range(9, 16), *range(17, 24)]
 
 
 def test_an_even_gap_is_halved_and_the_most_uncertain_comes_first() -> None:
