@@ -106,11 +106,11 @@ def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
     unrotated = np.diag([*volume.spacing[::-1], 1.0])
     rotated = volume.affine is not None and not shifted and not np.allclose(volume.affine, unrotated, rtol=1e-5)
     if name.endswith(".npy"):
-        lost = "voxel size and place" if volume.affine is not None or volume.unit != "voxel" else ""
+        lost = "voxel size and position in space" if volume.affine is not None or volume.unit != "voxel" else ""
     elif name.endswith((".tif", ".tiff")):
-        lost = "the place" if rotated or shifted else ""
+        lost = "the position in space" if rotated or shifted else ""
     else:
-        lost = "turned axes and the place" if rotated and not name.endswith((".nii", ".nii.gz")) else ""
+        lost = "turned axes and the position in space" if rotated and not name.endswith((".nii", ".nii.gz")) else ""
     return (f"{path.name} does not hold {lost}: NIfTI does.",) if lost else ()
 
 

@@ -290,7 +290,7 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
 def test_what_a_format_does_not_hold_is_said_before_the_work(oblique: Path, tmp_path: Path) -> None:
     """Turned axes go out in NIfTI; others say that they hold no place, or no voxel size."""
     for name, word in (
-        ("mask.tif", "place"),
+        ("mask.tif", "the position in space"),
         ("mask.zarr", "turned axes"),
         ("mask.mrc", "turned axes"),
         ("mask.npy", "voxel size"),
