@@ -114,9 +114,10 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     spacing is the edges of a voxel (z, y, x).
 
     Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
-    line that closes on itself) and `rings`, the number of tunnels within a junction, nearly always 0. Edges have
-    `points` (N, 3) from the lesser node to the greater and `radii` (N,), both with the nodes' own, `length` and mean
-    `radius`. Lengths are in spacing's unit; the first voxel's centre is the origin.
+    line that closes on itself) and `rings`, the number of tunnels within the node or around which a loop is shorter
+    than a voxel, nearly always 0. Edges have `points` (N, 3) from the lesser node to the greater and `radii` (N,), both
+    with the nodes' own, `length` and mean `radius`. Lengths are in spacing's unit; the first voxel's centre is the
+    origin.
     """
     if skeleton.shape != distance.shape:
         raise ValueError(f"skeleton and distance must have one shape, got {skeleton.shape} and {distance.shape}")
@@ -131,6 +132,7 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
                 _dissolve(graph, root)
     for _ in range(2):
         _move_to_axis(graph, distance, steps)
+    _close_loops(graph, steps)
     _finish(graph, distance, steps)
     return nx.convert_node_labels_to_integers(graph, ordering="sorted")  # type: ignore
 
@@ -197,11 +199,23 @@ def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, in
         for tip, root in ((one, other), (other, one)):
             if graph.degree(tip) == 1 and tip != root:
                 root_radius, tip_radius = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
-                length = float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
+                length = _measure_length(line, steps)
                 # Of a line with two free ends, only the thinner one can be a tip.
                 if (graph.degree(root) > 1 or root_radius >= tip_radius) and length < SPUR * root_radius + steps.max():
                     spurs.append((length, tip, root))
     return spurs
+
+
+def _measure_length(line: np.ndarray, steps: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
+
+
+def _close_loops(graph: nx.MultiGraph, steps: np.ndarray) -> None:
+    """Make each loop that is shorter than a voxel a ring of its node: it is no branch."""
+    for node, _, key, line in list(nx.selfloop_edges(graph, data="line", keys=True)):
+        if _measure_length(line, steps) < steps.max():
+            graph.remove_edge(node, node, key)
+            graph.nodes[node]["rings"] += 1
 
 
 def _dissolve(graph: nx.MultiGraph, node: int) -> None:

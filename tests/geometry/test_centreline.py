@@ -110,6 +110,8 @@ def test_cycles_are_the_tunnels(labyrinth, noise: tuple[int, float, float] | Non
     graph = centreline(found["skeleton"], found["distance"], box.spacing)
     assert betti_numbers(found["skeleton"]) == found["betti"] and found["betti"][1] > 0
     assert (nx.number_connected_components(graph), cycle_rank(graph)) == found["betti"][:2]
+    loops = [length for *_, length in nx.selfloop_edges(graph, data="length")]
+    assert all(length >= max(box.spacing) for length in loops)  # shorter ones are no branches
 
 
 def test_a_rough_surface_does_not_sprout() -> None:
