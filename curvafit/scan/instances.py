@@ -32,8 +32,6 @@ _AROUND = 5
 _DENSE = 2**20
 #: Voxels a side of the blocks in which labels are looked for, the names of the passes, and of the labels in errors.
 _BLOCK, _LOOK, _MEASURE, _LABELS = 256, "looking for instances", "measuring instances", "labels of instances"
-#: What is said of a volume with one label.
-ONE_LABEL = "One label, which is one body: number its pieces first, by scipy.ndimage.label, to have each by itself."
 #: Name, symbol and power of each number of a body, and how it comes from sums.
 OF_BODIES: tuple[tuple[str, str, int, Callable[[whole.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
@@ -74,7 +72,11 @@ def measure_instances(
         bodies = run(_MEASURE, partial(_measure_body, volume, list(boxes.items())), len(boxes))
         measured = tuple(body["measures"] for body in bodies)
     if len(measured) == 1:
-        return (replace(measured[0], notes=(*measured[0].notes, ONE_LABEL)),)
+        ((label, box),) = boxes.items()
+        _, count = ndimage.label(round_labels(volume.read(box)) == label, np.ones((3, 3, 3)))
+        if count > 1:
+            note = f"Label {label} is {count} pieces: if each is a body, number them first (docs: figure/cells)."
+            return (replace(measured[0], notes=(*measured[0].notes, note)),)
     return measured
 
 

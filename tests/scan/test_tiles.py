@@ -240,6 +240,19 @@ def test_neighbours_change_nothing(labels: np.ndarray, bodies: dict[int, Measure
     assert [each.value for each in alone.quantities] == [each.value for each in bodies[9].quantities]
 
 
+def test_one_body_of_several_pieces_is_said(labels: np.ndarray, tmp_path: Path) -> None:
+    """Pieces that touch at a corner are one: of a mask of three boxes the number is said, of one box nothing."""
+    path = tmp_path / "mask.npy"
+    for several in (True, False):
+        mask = np.zeros((30, 30, 70), np.uint8)
+        mask[5:20, 5:20, 5:20] = mask[20:25, 20:25, 20:25] = 4
+        mask[5:20, 5:20, 30:45] = mask[5:20, 5:20, 50:65] = 4 * several
+        np.save(path, mask)
+        result = done("measure", path, "--labels")
+        assert result.stdout.endswith("1 body; 0 are cut by the border, 0 too thin for curvature.\n")
+        assert ("Label 4 is 3 pieces" in result.stderr) == ("pieces" in result.stderr) == several
+
+
 def test_the_command_writes_rows_for_each_instance(labels: np.ndarray, tmp_path: Path) -> None:
     path, table = tmp_path / "labels.npy", tmp_path / "table.csv"
     np.save(path, np.where(labels == ROD, 0, labels))
