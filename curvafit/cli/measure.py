@@ -239,8 +239,7 @@ def _print_instances(instances: Sequence[Measures]) -> None:
     from curvafit.core.units import format_number, power_name
 
     rows = []
-    if len(instances) == 1:
-        say_notes(instances[0].notes)
+    say_notes(instances[0].notes if len(instances) == 1 else ())
     for k, quantity in enumerate(instances[0].quantities):
         values = [instance.quantities[k].value for instance in instances]
         known = sorted(filter(math.isfinite, values)) or [math.nan]
@@ -249,5 +248,5 @@ def _print_instances(instances: Sequence[Measures]) -> None:
     print_table(("", "", "least", "median", "greatest", "unit"), rows, right=(2, 3, 4))
     cut = sum(instance["S.cut"].value > 0 for instance in instances)
     thin = sum(math.isnan(instance["H"].value) for instance in instances)
-    bodies, are = "body" if len(instances) == 1 else "bodies", "is" if cut == 1 else "are"
-    say(f"{len(instances)} {bodies}; {cut} {are} cut by the border, {thin} too thin for curvature.")
+    bodies = "1 body" if len(instances) == 1 else f"{len(instances)} bodies"
+    say(f"{bodies}; {cut} cut by the border, {thin} too thin for curvature.")

@@ -114,10 +114,9 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     spacing is the edges of a voxel (z, y, x).
 
     Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
-    line that closes on itself) and `rings`, the number of tunnels within the node or around which a loop is shorter
-    than a voxel, nearly always 0. Edges have `points` (N, 3) from the lesser node to the greater and `radii` (N,), both
-    with the nodes' own, `length` and mean `radius`. Lengths are in spacing's unit; the first voxel's centre is the
-    origin.
+    line that closes on itself) and `rings`, the number of tunnels within a node, or of loops shorter than a voxel,
+    nearly always 0. Edges have `points` (N, 3) from the lesser node to the greater and `radii` (N,), both with the
+    nodes' own, `length` and mean `radius`. Lengths are in spacing's unit; the first voxel's centre is the origin.
     """
     if skeleton.shape != distance.shape:
         raise ValueError(f"skeleton and distance must have one shape, got {skeleton.shape} and {distance.shape}")
@@ -132,7 +131,6 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
                 _dissolve(graph, root)
     for _ in range(2):
         _move_to_axis(graph, distance, steps)
-    _close_loops(graph, steps)
     _finish(graph, distance, steps)
     return nx.convert_node_labels_to_integers(graph, ordering="sorted")  # type: ignore
 
@@ -199,23 +197,11 @@ def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, in
         for tip, root in ((one, other), (other, one)):
             if graph.degree(tip) == 1 and tip != root:
                 root_radius, tip_radius = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
-                length = _measure_length(line, steps)
+                length = float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
                 # Of a line with two free ends, only the thinner one can be a tip.
                 if (graph.degree(root) > 1 or root_radius >= tip_radius) and length < SPUR * root_radius + steps.max():
                     spurs.append((length, tip, root))
     return spurs
-
-
-def _measure_length(line: np.ndarray, steps: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
-
-
-def _close_loops(graph: nx.MultiGraph, steps: np.ndarray) -> None:
-    """Make each loop that is shorter than a voxel a ring of its node: it is no branch."""
-    for node, _, key, line in list(nx.selfloop_edges(graph, data="line", keys=True)):
-        if _measure_length(line, steps) < steps.max():
-            graph.remove_edge(node, node, key)
-            graph.nodes[node]["rings"] += 1
 
 
 def _dissolve(graph: nx.MultiGraph, node: int) -> None:
@@ -271,17 +257,21 @@ def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) ->
 
 def _finish(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
     """Replace the attributes of nodes and edges by those that `centreline` documents, lengths in spacing's unit."""
-    for node, data in graph.nodes(data=True):
-        kind_by_degree = ("point", "end", "loop" if graph.has_edge(node, node) else "junction", "junction")
-        data |= {"position": data.pop("centre") * steps, "kind": kind_by_degree[min(graph.degree(node), 3)]}
-    for *ends, data in graph.edges(data=True):
+    for *ends, key, data in list(graph.edges(keys=True, data=True)):
         line = _smooth(data.pop("line"))
         points, radii = line * steps, _measure_radii(distance, line, steps)
         lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        if ends[0] == ends[1] and lengths.sum() < steps.max():  # around a hole of a voxel: it is no branch
+            graph.remove_edge(ends[0], ends[1], key)
+            graph.nodes[ends[0]]["rings"] += 1
+            continue
         mean = np.average((radii[1:] + radii[:-1]) / 2, weights=lengths) if lengths.sum() else radii.mean()
         data |= {"points": points, "radii": radii, "length": float(lengths.sum()), "radius": float(mean)}
         for node, radius in zip(sorted(ends), (radii[0], radii[-1]), strict=True):
             graph.nodes[node]["radius"] = max(graph.nodes[node]["radius"], float(radius))
+    for node, data in graph.nodes(data=True):
+        kind_by_degree = ("point", "end", "loop" if graph.has_edge(node, node) else "junction", "junction")
+        data |= {"position": data.pop("centre") * steps, "kind": kind_by_degree[min(graph.degree(node), 3)]}
 
 
 def _smooth(line: np.ndarray) -> np.ndarray:

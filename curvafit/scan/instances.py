@@ -72,7 +72,7 @@ def measure_instances(
         bodies = run(_MEASURE, partial(_measure_body, volume, list(boxes.items())), len(boxes))
         measured = tuple(body["measures"] for body in bodies)
     if len(measured) == 1:
-        ((label, box),) = boxes.items()
+        label, box = boxes.popitem()
         _, count = ndimage.label(round_labels(volume.read(box)) == label, np.ones((3, 3, 3)))
         if count > 1:
             note = f"Label {label} is {count} pieces: if each is a body, number them first (docs: figure/cells)."

@@ -17,7 +17,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, list_numbers
-from curvafit.segmentation.reconstruction import UNTOLD, fill_volume, load_example, load_image
+from curvafit.segmentation.reconstruction import UNTOLD, Inputs, fill_between, load_example, load_image
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, mark_between, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
@@ -145,18 +145,21 @@ class _Inputs:
         return bool(self.in_slices.all())
 
     def fill(self, index: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
-        """Fill the label with an index in a box, or all labels as one structure; `more` goes to `fill_volume`."""
-        indices, known, working = self.indices[box], self.known, more.pop("working", self.working)
+        """Fill the label with an index in a box, or all labels as one structure; `more` is as in `reconstruct`."""
+        indices, known, working = self.indices[box], self.known, more.get("working", self.working)
         inside = (indices > 0 if index is None else indices == index).astype(np.uint8)
         start, stop, _ = box[known.axis].indices(self.indices.shape[known.axis])
-        places = [place - start for place in known.places if start <= place < stop]
-        which: dict[str, Any] = {"ignore": None, "known": places, "axis": known.axis}
+        which: dict[str, Any] = {"ignore": UNKNOWN if self.marked else None, "axis": known.axis}
         if self.marked:
-            inside[indices < 0], which = UNKNOWN, {"ignore": UNKNOWN, "axis": known.axis}
+            inside[indices < 0] = UNKNOWN
+        else:
+            which["known"] = [place - start for place in known.places if start <= place < stop]
         mask = replace(known.volume, array=inside, affine=None, notes=())
         if law is None:
             working = replace(working, tile=None)  # a box of a label is filled at once
-        return fill_volume(mask, which, law, working=working, reading={}, larger=known, **more)
+        inputs = Inputs.load(mask, which, law, more.get("image"), more.get("example"), working=working, reading={})
+        with inputs.open_run(working, more["progress"]) as run:
+            return fill_between(inputs, run, working, more["progress"], larger=known)
 
 
 def _fill_instances(

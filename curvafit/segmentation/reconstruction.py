@@ -148,24 +148,13 @@ def reconstruct(
     volume = load(slices, **reading, lazy=True)
     which = {"every": every, "known": known, "ignore": ignore, "axis": axis}
     check_which(volume.shape, **which, suggest=suggest)  # type: ignore[arg-type]
-    options = {"image": image, "example": example, "suggest": suggest, "working": working, "progress": progress}
-    return fill_volume(volume, which, prior, reading=reading, **options)  # type: ignore[arg-type]
-
-
-def fill_volume(
-    volume: Volume, which: dict[str, Any], prior: LawLike | None, *, image: Source | None = None,
-    example: Source | None = None, suggest: int = 0, working: Working, progress: Progress = silent,
-    reading: dict[str, Any], larger: Known | None = None,
-) -> Segmentation:  # fmt: skip
-    """Fill a volume as `reconstruct` does, with the options `which` of its known slices. Of the box of a `larger`
-    volume, the shares and the numbers of slices that the result states are those of the larger one."""
-    inputs = _Inputs.load(volume, which, prior, image, example, working=working, reading=reading)
+    inputs = Inputs.load(volume, which, prior, image, example, working=working, reading=reading)
     with inputs.open_run(working, progress) as run:
-        return _fill_between(inputs, suggest, run, working, progress, larger)
+        return fill_between(inputs, run, working, progress, suggest)
 
 
 @dataclass(frozen=True, eq=False)
-class _Inputs:
+class Inputs:
     """What a volume is filled from: its labels, the options `which` of its known slices, a law with notes on it, the
     network, an image and an example; and whether it is filled in blocks."""
 
@@ -182,7 +171,7 @@ class _Inputs:
     def load(
         cls, volume: Volume, which: dict[str, Any], prior: LawLike | None, image: Source | None,
         example: Source | None, *, working: Working, reading: dict[str, Any],
-    ) -> _Inputs:  # fmt: skip
+    ) -> Inputs:  # fmt: skip
         """Load the inputs, and the volume if it is filled at once; raise ScanError where inputs exclude each other."""
         choose_epsilon(volume, working.epsilon)  # refuses an ε before the work
         large = working.tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
@@ -209,10 +198,11 @@ class _Inputs:
         return open_run(crew, working.store, identity, progress, _ENDS)
 
 
-def _fill_between(
-    inputs: _Inputs, suggest: int, run: Run, working: Working, progress: Progress, larger: Known | None
+def fill_between(
+    inputs: Inputs, run: Run, working: Working, progress: Progress, suggest: int = 0, larger: Known | None = None
 ) -> Segmentation:
-    """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is."""
+    """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is. Of the
+    box of a `larger` volume, shares and numbers of slices are stated of the larger one."""
     volume = inputs.volume
     known = Known.find(volume, run, **inputs.which)
     whole = larger or known
@@ -236,11 +226,10 @@ def _fill_between(
         filled, engine = _weigh_evidence(engine, trial, task, known, slices, lowered)
         phase, notes = known.turn_back(lowered.phase), (*notes, *grid.notes)
         inside = flow_summary(part * float(lowered.mask.mean()), lowered.energies, lowered.steps)
-    uncertain = filled.judge(known, slices, engine, suggest, part)
+    uncertain = filled.judge(known, slices, engine, suggest)
     tested = "the example" if example else "slices left out" if trial.law else "generated shapes"
-    options = {"tested": tested, "image": evidence is not None}
-    length = whole.volume.shape[whole.axis]
-    status, doubts = describe_filled(head, inside, part * filled.share, uncertain, whole.places, length, **options)
+    options = {"tested": tested, "image": evidence is not None, "length": whole.volume.shape[known.axis], "part": part}
+    status, doubts = describe_filled(head, inside, filled.share, uncertain, whole.places, **options)
     return Segmentation.of(
         volume, filled.mask, phase, trial.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
         weight=None, status=status, uncertainty=uncertain, image=inputs.image,
@@ -248,7 +237,7 @@ def _fill_between(
 
 
 def _adapt(
-    inputs: _Inputs, known: Known, slices: Slices, example: Example | None, progress: Progress
+    inputs: Inputs, known: Known, slices: Slices, example: Example | None, progress: Progress
 ) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
     """Return the network, tuned on the example if there is one; an image's log-odds (length, Y, X); and notes."""
     taught, image = inputs.taught, inputs.image
@@ -371,11 +360,10 @@ class _Filled:
         """The mask's fraction of the volume."""
         return float(self.sums["inside"] / math.prod(self.mask.shape))
 
-    def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int, part: float) -> Uncertainty:
-        """Return how sure the volume is, `part` of the one whose shares are stated, and which slices to annotate."""
+    def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
+        """Return how sure the volume is, and which slices to annotate next."""
         sums, whole = self.sums, engine.evidence is not None
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
-        shares = share_by_slices(slices.areas, slices.places, slices.length, whole=whole)
         entropies = sums["along 0"] * slices.between, sums["along 1"], sums["along 2"]
         order = axis_first((0, 1, 2), known.axis)  # the volume's axes in the order of the sums
         return Uncertainty(
@@ -383,8 +371,8 @@ class _Filled:
             engine.taught.error,
             suggest_slices(sums["along 0"], slices.places, suggest),
             dice,
-            known_share=tuple(part * share for share in shares),
-            mean_probability=part * float(sums["total"]) / math.prod(slices.shape),
+            known_share=share_by_slices(slices.areas, slices.places, slices.length, whole=whole),
+            mean_probability=float(sums["total"]) / math.prod(slices.shape),
             entropies=tuple(entropies[order.index(axis)] for axis in range(3)),
         )
 

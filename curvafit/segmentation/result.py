@@ -320,19 +320,20 @@ def describe_run(segmentation: Segmentation, options: Mapping[str, Any], scan: V
 
 def describe_filled(
     head: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
-    image: bool = False,
+    image: bool = False, part: float = 1.0,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
     """Return the status of a volume of `length` slices with known ones at `places`, and notes on doubts. `head` is how
-    it was filled, `inside` describes the mask, `share` is its fraction of the volume, and `tested` names what the
-    probabilities were tested on. With an image all slices are filled."""
+    it was filled, `inside` describes the mask, `share` is its fraction of the volume, `tested` names what probabilities
+    were tested on, and shares are stated of a volume that this is a `part` of. With an image all slices are filled."""
     filled = slice(0, length) if image else filled_range(places, length)
     unfilled = length - (filled.stop - filled.start)
     known = uncertain.known_share
     beyond = f", {unfilled} beyond them not filled" if unfilled > 0 else ""
-    span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
+    percent = 100 * part
+    span = f" ({percent * known[1]:.2f} to {percent * known[2]:.2f})" if known[1:] else ""
     status = (
         f"{head}: {len(places)} of {length} slices known{beyond}, {inside}, "
-        f"{100 * known[0]:.2f} %{span} by known slices alone, {100 * uncertain.mean_probability:.2f} % by "
+        f"{percent * known[0]:.2f} %{span} by known slices alone, {percent * uncertain.mean_probability:.2f} % by "
         f"probabilities; expect a Dice of {uncertain.expected_dice:.2f} between known slices; "
         f"probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"
     )

@@ -249,7 +249,7 @@ def test_one_body_of_several_pieces_is_said(labels: np.ndarray, tmp_path: Path) 
         mask[5:20, 5:20, 30:45] = mask[5:20, 5:20, 50:65] = 4 * several
         np.save(path, mask)
         result = done("measure", path, "--labels")
-        assert result.stdout.endswith("1 body; 0 are cut by the border, 0 too thin for curvature.\n")
+        assert result.stdout.endswith("1 body; 0 cut by the border, 0 too thin for curvature.\n")
         assert ("Label 4 is 3 pieces" in result.stderr) == ("pieces" in result.stderr) == several
 
 
