@@ -73,7 +73,7 @@ def measure_instances(
         measured = tuple(body["measures"] for body in bodies)
     if len(measured) == 1:
         label, box = boxes.popitem()
-        _, count = ndimage.label(round_labels(volume.read(box)) == label, np.ones((3, 3, 3)))
+        _, count = ndimage.label(round_labels(volume.read(box)) == label, np.ones((3, 3, 3)))  # type: ignore[misc]
         if count > 1:
             note = f"Label {label} is {count} pieces: if each is a body, number them first (docs: figure/cells)."
             return (replace(measured[0], notes=(*measured[0].notes, note)),)
