@@ -15,7 +15,16 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.core.checks import as_tuple, check_choice, check_int, check_positive, check_seed, check_type, quoted
+from curvafit.core.checks import (
+    as_tuple,
+    check_choice,
+    check_float,
+    check_int,
+    check_positive,
+    check_seed,
+    check_type,
+    quoted,
+)
 from curvafit.core.runtime import Progress, show_share
 from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
@@ -76,7 +85,7 @@ class Recipe:
         object.__setattr__(self, "seed", check_seed(self.seed))
         expected = "calibres as two positive factors, the lower first"
         calibres = as_tuple(self.calibres, expected, 2)
-        low, high = (check_positive(n, expected, of=calibres) for n in calibres)
+        low, high = (check_float(n, expected, 1e-3, 1e3, of=calibres) for n in calibres)
         if low > high:
             raise ValueError(f"expected {expected}, got {quoted(calibres)}")
         object.__setattr__(self, "calibres", (low, high))

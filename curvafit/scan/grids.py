@@ -211,11 +211,12 @@ def restore_signs(distance: np.ndarray, mask: np.ndarray, voxels: Grid) -> None:
     taps = np.array(gaussian_taps(PULL_WIDTH), np.float32)
     kernel = np.pad(taps[:, None, None] * taps[:, None] * taps, ((0, 0), (0, 0), (0, -len(taps) % _LANES)))
     for _ in range(SWEEPS):
-        places = np.flatnonzero((distance > 0) != mask)
+        wrong = (distance > 0) != mask
+        places = np.flatnonzero(wrong)
         if not len(places):
             break
         if len(places) > FEW * distance.size:
-            errors = np.where((distance > 0) != mask, distance, np.float32(0))
+            errors = np.where(wrong, distance, np.float32(0))
             distance -= np.float32(PULL) * gaussian_blur(errors, voxels, PULL_WIDTH)
             continue
         _add_gaussians(distance, places, np.float32(-PULL) * distance.ravel()[places], kernel)

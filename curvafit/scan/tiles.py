@@ -525,9 +525,8 @@ def _measure_tiles(
         options |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
     with open_run(workers, store, options, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(structure, run)
-        plan = replace(
-            plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan, run.processes))), maps=maps
-        )
+        cores = cut_boxes(plan.volume.shape, edge or _choose_edges(plan, run.processes))
+        plan = replace(plan, cores=tuple(cores), maps=maps)
         tiles_note = _describe_tiles(plan, run.processes)
         records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), tiles_note)
         # The factors that `morphology.local_thickness` would choose for the whole volume.
