@@ -116,7 +116,7 @@ def case(name: str, way: str) -> Values:
     else:
         edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
         logits = read_image(grey, Slices(truth[places], tuple(places), len(truth), edges, mask.unit))[0]
-        likely, inside = expit(logits), logits > best_log_odds(logits)
+        likely, inside = expit(logits), logits > best_log_odds(logits[unknown])
     counts, near = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown]), near_surface(inside)
     return {
         "dice": float(dice_of(counts.sum(0))),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import combinations_with_replacement, product
 from typing import Any
@@ -15,6 +14,9 @@ from scipy import ndimage
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
+from curvafit.priors import kernels
+from curvafit.priors.grid import Grid
+from curvafit.priors.kernels.threads import map_threads
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.uncertainty import entropy, fit_weights
 
@@ -23,7 +25,7 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 #: Deviation of a second Gaussian before derivatives are taken.
 SMOOTH = 0.7
 #: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
-LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 127
+LEARNT, TREES, RATE, LEAVES = 200_000, 80, 0.15, 255
 #: Voxels whose features are computed at once; most voxels of an image whose features are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
 #: By less than this fraction voxels' edges differ where they are cubes.
@@ -31,8 +33,9 @@ CUBIC = 0.01
 
 
 def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
-    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X); and the
-    fraction of the entropy of held-out known slices that they explain. Raises ImportError without scikit-learn.
+    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X), 0 in the
+    known slices; and the fraction of the entropy of held-out known slices that they explain. Raises ImportError without
+    scikit-learn.
 
     Trees learn from the known slices which voxels are inside, by grey levels, slopes and Hessians at several widths.
     They first learn from every second known slice: the others calibrate the log-odds, and give the fraction. Where one
@@ -50,12 +53,12 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
         slope, constant, gain = _hold_out(features, known)
     progress("learning from the image", 0.35)
     trees = _train_trees(features, known)
-    evidence = np.empty(values.shape, dtype=np.float32)
+    evidence, asked = np.zeros(values.shape, dtype=np.float32), ~np.isin(np.arange(len(values)), slices.places)
     for rows, block in cached or compute_features():
         progress("reading the image", 0.6 + 0.4 * rows[0] / len(values))
-        for row, plane in zip(rows, block, strict=True):
-            logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
-            evidence[row] = (slope * logits + constant).reshape(plane.shape[:2])
+        for row in rows[asked[rows]]:
+            logits = trees.decision_function(block[row - rows[0]].reshape(-1, block.shape[-1]))
+            evidence[row] = (slope * logits + constant).reshape(evidence[row].shape)
     progress("reading the image", 1.0)
     return evidence, gain
 
@@ -92,31 +95,40 @@ def _features(levels: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np
     lengths = np.array(spacing) / min(spacing)
     metrics = [lengths] if np.ptp(lengths) < CUBIC else [lengths, np.ones(3)]
     # Gaussians are cut at 4 deviations, and each of two derivatives reads one more slice.
-    halo, depth = int(4 * (max(WIDTHS) + SMOOTH)) + 3, len(levels)
+    halo, depth = int(4 * (max(WIDTHS) + SMOOTH)) + 4, len(levels)
     thickness = max(1, HELD // levels[0].size)
 
     def compute_block(start: int) -> tuple[np.ndarray, np.ndarray]:
         rows, low = np.arange(start, min(start + thickness, depth)), max(start - halo, 0)
         slab = levels[low : rows[-1] + halo + 1]
-        features = [slab[rows - low].astype(np.float16)]
+        inner, features = slice(rows[0] - low, rows[-1] - low + 1), [levels[rows].astype(np.float16)]
         for edges, width in product(metrics, WIDTHS):
-            features += [values[rows - low].astype(np.float16) for values in _describe_at(slab, edges, width)]
+            features += [values.astype(np.float16) for values in _describe_at(slab, inner, edges, width)]
         return rows, np.stack(features, axis=-1)
 
     starts, count = range(0, depth, thickness), torch.get_num_threads()
-    with ThreadPoolExecutor(count) as threads:
-        for k in range(0, len(starts), count):  # `map` alone would compute all blocks ahead, and hold them
-            yield from threads.map(compute_block, starts[k : k + count])
+    for k in range(0, len(starts), count):  # all at once would compute all blocks ahead, and hold them
+        yield from map_threads(compute_block, starts[k : k + count])
 
 
-def _describe_at(levels: np.ndarray, edges: np.ndarray, width: float) -> tuple[np.ndarray, ...]:
-    """Return levels smoothed by a Gaussian, their slope, and the eigenvalues of their Hessian (Z, Y, X)."""
-    blur: Any = partial(ndimage.gaussian_filter, mode="nearest")
-    smooth = blur(levels, np.maximum(width / edges, LEAST))
-    gradient = np.gradient(blur(smooth, np.maximum(SMOOTH / edges, LEAST)), *edges)
+def _describe_at(levels: np.ndarray, inner: slice, edges: np.ndarray, width: float) -> Iterator[np.ndarray]:
+    """Yield levels smoothed by a Gaussian, their slope, and the eigenvalues of their Hessian, of the slices `inner`."""
+    smooth = _blur(levels, np.maximum(width / edges, LEAST))
+    yield smooth[inner]
+    near = slice(max(inner.start - 2, 0), inner.stop + 2)
+    gradient = np.gradient(_blur(smooth, np.maximum(SMOOTH / edges, LEAST))[near], *edges)
     pairs = combinations_with_replacement(range(3), 2)
     hessian = [np.gradient(gradient[i], edges[j], axis=j) for i, j in pairs]
-    return smooth, np.sqrt(sum(component**2 for component in gradient)), *_eigenvalues(*hessian)
+    for values in (np.sqrt(sum(component**2 for component in gradient)), *_eigenvalues(*hessian)):
+        yield values[inner.start - near.start : inner.stop - near.start]
+
+
+def _blur(values: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Blur by a Gaussian of a deviation along each axis (3,), in voxels."""
+    if min(values.shape) < max(4, *deviations):  # no grid
+        return ndimage.gaussian_filter(values, deviations, mode="reflect")
+    grid = Grid(values.shape, tuple(1 / deviations), "replicate")
+    return kernels.gaussian_blur(torch.from_numpy(values), grid, 1.0).numpy()
 
 
 def _eigenvalues(
