@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
@@ -124,11 +123,11 @@ def _describe_at(levels: np.ndarray, inner: slice, edges: np.ndarray, width: flo
 
 
 def _blur(values: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Blur by a Gaussian of a deviation along each axis (3,), in voxels."""
-    if min(values.shape) < max(4, *deviations):  # no grid
-        return ndimage.gaussian_filter(values, deviations, mode="reflect")
-    grid = Grid(values.shape, tuple(1 / deviations), "replicate")
-    return kernels.gaussian_blur(torch.from_numpy(values), grid, 1.0).numpy()
+    """Blur by a Gaussian of a deviation along each axis (3,), in voxels; beyond the image its border's values go on."""
+    reach = np.ceil(4 * deviations).astype(int).tolist()
+    padded = np.pad(values, [(n, n) for n in reach], mode="edge")
+    blurred = kernels.gaussian_blur(torch.from_numpy(padded), Grid(padded.shape, tuple(1 / deviations)), 1.0).numpy()
+    return blurred[tuple(slice(n, -n) for n in reach)]
 
 
 def _eigenvalues(
