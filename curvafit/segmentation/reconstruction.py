@@ -422,11 +422,12 @@ def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = Fals
     rows = core[0]
     counts = count_probabilities(likely[slices.between[rows]])  # of marked voxels too, as for `_Engine.level`
     likely = slices.keep_known(likely.astype(np.float32), core)
-    entropies, between = doubt(likely), likely[slices.between[rows]]
-    along = {f"along {k}": entropies.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
+    across, down, right = (np.zeros(n) for n in likely.shape)
+    for row, entropies in enumerate(map(doubt, likely)):
+        across[row], down[:], right[:] = entropies.sum(), down + entropies.sum(1), right + entropies.sum(0)
     filled = likely if whole else likely[~slices.unfilled[rows]]
-    sums = {"sum": between.sum(dtype=np.float64), "total": filled.sum(dtype=np.float64)}
-    return {"likely": likely, "counts": counts, **sums, **along}
+    sums = {"sum": likely[slices.between[rows]].sum(dtype=np.float64), "total": filled.sum(dtype=np.float64)}
+    return {"likely": likely, "counts": counts, **sums, "along 0": across, "along 1": down, "along 2": right}
 
 
 def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[str, Any]:

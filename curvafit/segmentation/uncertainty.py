@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
-from scipy.special import entr, expit, logit
-from scipy.stats import t as student
+from scipy.special import entr, expit, logit, stdtrit
 
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.slices import filled_range, harmonic_distance
@@ -138,7 +137,7 @@ def share_by_slices(
     walk = max(0.0, residual - noise * b) / a
     ends = np.maximum([at[0] - filled.start, filled.stop - 1 - at[-1]], 0)
     walked = (gaps * (gaps**2 - 1) / 12).sum() + (ends * (ends + 1) * (2 * ends + 1) / 6).sum()
-    half = float(student.ppf(0.975, len(residuals)) * np.sqrt(walk * walked + noise * weights @ weights)) / length
+    half = float(stdtrit(len(residuals), 0.975) * np.sqrt(walk * walked + noise * weights @ weights)) / length
     return share, max(share - half, 0.0), min(share + half, 1.0)
 
 
