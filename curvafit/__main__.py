@@ -29,6 +29,7 @@ def main() -> None:
         raise SystemExit(exit_code(signal)) from None
     finally:
         leave()
+        gc.freeze()  # to look for garbage once more at the end would take half a second
 
 
 def _keep_memory() -> None:
