@@ -43,7 +43,9 @@ COARSE, WIDEST = 24, 48
 #: voxels, blurred by 16, and corrected at thin places.
 HALO = 28
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
-LARGEST_TILE, SHORTEST = 260**3, 32
+LARGEST_TILE, SHORTEST = 264**3, 32
+#: Least tiles of a process, so that none waits long for the others at the end.
+FEWEST_TILES = 4
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
 _VOXEL_BYTES, _PROGRAM_BYTES = 30, 350 * 2**20
 #: What is kept at each voxel where it is asked for, and the bytes that a voxel then takes, with its tile's.
@@ -197,16 +199,23 @@ def _describe_tiles(plan: Plan, processes: int) -> str:
 def _choose_edges(plan: Plan, processes: int) -> tuple[int, ...]:
     """Return the edges of tiles, in voxels, of at most `LARGEST_TILE` voxels with their surroundings, on both grids; or
     of more where balls are so wide that a core would be less than half of its tile's edge, and memory allows it."""
-    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.volume.spacing)
+    side, finest, shape = round(LARGEST_TILE ** (1 / 3)), min(plan.volume.spacing), plan.volume.shape
     distance = _read_distance(min(plan.reach, WIDEST * finest), finest)
     affordable = (memory() / (4 * processes * WORKED)) ** (1 / 3)
     wide = max(side, int(min(4 * distance / finest, affordable)))
-    edges = []
-    for n, h, scale in zip(plan.volume.shape, plan.volume.spacing, plan.scale, strict=True):
-        longest = min(wide - 2 * math.ceil(distance / h), int((side - 2 * HALO) * scale))
-        count = math.ceil(n / max(SHORTEST, longest))
-        edges.append(math.ceil(n / count))
-    return tuple(edges)
+    margins, scale = [math.ceil(distance / h) for h in plan.volume.spacing], np.array(plan.scale)
+    longest = np.minimum(wide - 2 * np.array(margins), ((side - 2 * HALO) * scale).astype(int)).clip(SHORTEST)
+    counts = np.ceil(shape / longest).astype(int)
+
+    def fits(counts: np.ndarray) -> bool:
+        cores, sides = np.ceil(shape / counts), np.minimum(counts - 1, 2)  # with neighbours
+        read, worked = cores + sides * margins, cores / scale + sides * HALO
+        return read.prod() <= wide**3 and worked.prod() <= LARGEST_TILE and counts.prod() >= FEWEST_TILES * processes
+
+    # Cubes are a start: surroundings are read once less along an axis on which a tile can be longer.
+    while fewer := [less for less in counts - np.eye(3, dtype=int) if less.all() and fits(less)]:
+        counts = min(fewer, key=lambda less: less.max() - less.min())
+    return tuple(np.ceil(shape / counts).astype(int).tolist())
 
 
 def _read_distance(radius: float, edge: float) -> float:
