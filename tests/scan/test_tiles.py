@@ -3,6 +3,8 @@
 import csv
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from curvafit.scan.measures import Measures
 from curvafit.scan.survey import Plan
 from curvafit.scan.tiles import measure
 from curvafit.volumes import ScanError, Volume, save
+from curvafit.volumes.volume import cut_boxes, grow
 
 #: Shapes of scans, in voxels: of quick tests, and of those of any size of tiles, which have intervals.
 SMALL, LARGE = (66, 51, 54), (99, 67, 73)
@@ -297,6 +300,16 @@ def test_wide_gaps_do_not_cut_a_scan_into_small_tiles() -> None:
     mask[4:12] = mask[118:126] = True
     found = measure(mask, roi=np.ones(mask.shape, np.uint8))
     assert not [note for note in found.notes if "tiles" in note]
+
+
+@pytest.mark.parametrize("processes", [1, 2, 8])
+def test_tiles_are_few_but_fit_into_memory_and_are_shared(processes: int) -> None:
+    volume = SimpleNamespace(shape=(512, 512, 512), spacing=(1.0, 1.0, 1.0))
+    plan: Any = SimpleNamespace(volume=volume, reach=5.0, scale=(1.0, 1.0, 1.0))
+    cores = cut_boxes(volume.shape, tiles._choose_edges(plan, processes))
+    read = max(math.prod(e.stop - e.start for e in grow(core, tiles.HALO, volume.shape)) for core in cores)
+    assert read <= tiles.LARGEST_TILE
+    assert len(cores) == 27 if processes == 8 else 4 * processes <= len(cores) < 27
 
 
 def test_maps_of_wide_balls_are_painted_where_they_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
