@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +21,7 @@ from scipy.special import stdtrit
 from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name, unit_name
 from curvafit.geometry.description import descriptors
-from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families, join_diagrams
+from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, fabric
 from curvafit.geometry.morphology import border_weights, smooth_surface
 from curvafit.geometry.topology import euler_shares
@@ -467,32 +466,10 @@ def find_direction(sums: Sums) -> tuple[float, float, float]:
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """Measure the geometric curvature diagram of a prepared scan. A large one is measured in tiles, each cell in one;
-    places are in working units from the centre of the grid's first voxel."""
-    grid = prepared.grid
-    cuts = [[slice(None)] if grid.periodic else _cut_axis(n) for n in grid.shape]
-    diagrams: list[Diagram] = []
-    for tile in itertools.product(*cuts):
-        with contextlib.suppress(NoSurface):
-            diagrams.append(_measure_tile(prepared, tile))
-    if not diagrams:
-        raise NoSurface("expected a surface inside the scan, got none away from its borders")
-    return join_diagrams(diagrams)
-
-
-def _cut_axis(n: int) -> list[slice]:
-    """Cut an axis of n voxels into intervals that overlap by their margins, of `MARGIN` voxels at each end."""
-    count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
-    ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
-    return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
-
-
-def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
-    phase, grid = np.ascontiguousarray(prepared.phase[tile]), prepared.part(tile)  # type: ignore[arg-type]
-    where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
-    measured = diagram(phase, grid, WORKING_EPSILON, where=where)
-    corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)
-    return replace(measured, places=measured.places + corner)
+    """Measure the geometric curvature diagram of a prepared scan; places are in working units from the centre of the
+    grid's first voxel. Raises NoSurface where there is none away from the scan's borders."""
+    where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)
+    return diagram(np.ascontiguousarray(prepared.phase), prepared.grid, WORKING_EPSILON, where=where)
 
 
 class Reading(NamedTuple):

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from exact import Gyroid, centres
 from scipy import ndimage
 from shapes import grown
 
 from curvafit.generation.schedule import LEARNED, schedule
 from curvafit.geometry.description import descriptors
-from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.inference import Growth, estimate
 from curvafit.inference.atlas import load_atlas
@@ -22,7 +20,7 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference, infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import PARAMETERS, mirror_parameters, parameters_of
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.grid import Grid
 from curvafit.priors.law import FORMAT, Law, preset
 from curvafit.report.inference import write_inference
 from curvafit.scan.measures import read_texture, scan_diagram
@@ -199,21 +197,6 @@ def test_grey_noise_is_noise_and_a_texture_under_it_is_not(tubes: np.ndarray) ->
     grey = rng.normal(100, 20, GRID.shape).astype(np.float32)
     assert prepare(Volume(grey, (1.0,) * 3, "um"), kind="image").noise
     assert not prepare(Volume(grey + 60 * (tubes > 0), (1.0,) * 3, "um"), kind="image").noise
-
-
-def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:
-    rng = np.random.default_rng(0)
-    prepared = prepare(Volume(np.tile(tubes, (1, 1, 5)), (1.0, 1.0, 1.0), "um"), kind="field")
-    assert prepared.phase.shape == (32, 32, 160)
-    tiled = scan_diagram(prepared)
-    grid = Grid((32, 32, 160), prepared.grid.spacing, "replicate")
-    whole = diagram(torch.from_numpy(prepared.phase), grid, WORKING_EPSILON)
-    assert tiled.area == pytest.approx(whole.area, rel=1e-6)
-    np.testing.assert_allclose(tiled.mean(), whole.mean(), rtol=1e-6, atol=1e-6)
-    direction = rng.normal(size=2)
-    for share in (0.1, 0.5, 0.9):
-        one, other = (_quantile(each, direction, share) for each in (tiled, whole))
-        assert one == pytest.approx(other, rel=1e-3, abs=0.05)
 
 
 def test_a_region_of_interest_hides_the_surface_that_it_cuts() -> None:
