@@ -30,6 +30,9 @@ WIDEST, MOST = 2048, 64
 MASS = PARAMETERS.index("m0")
 #: Margin on each side of the box of the parameters, as a fraction of the range that was drawn.
 RIM = 0.02
+#: Deviation of what the flows miss themselves, however much of a structure is seen, in deviations of the parameters'
+#: logits: chosen so that 90 % intervals held 86 % of the parameters of shapes of 100³ grown by the paper's protocol.
+MISSED = 0.15
 #: A combination is known where a scan takes away at least this fraction of its variance among laws.
 KNOWN = 0.5
 
@@ -139,7 +142,9 @@ class Posterior:
         with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(seed)
             draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, counts, strict=True)]
-        standard = torch.cat(draws).movedim(0, 1).double().numpy()
+            drawn = torch.cat(draws).movedim(0, 1)
+            drawn += MISSED * torch.randn_like(drawn)
+        standard = drawn.double().numpy()
         return self.from_logits(standard * self.spread + self.centre)
 
     def draw(self, reading: Reading, count: int, seed: int = 0) -> np.ndarray:
