@@ -113,12 +113,8 @@ def check_strengths(coefficients: Iterable[float | Tensor], epsilon: float, orie
     if orientation is not None:
         terms.append(("the orientation", orientation, POWERS["a00"]))
     for name, value, power in terms:
-        strength = _largest(value) * epsilon**power
+        most = float(value.detach().abs().max()) if isinstance(value, Tensor) else abs(value)
+        strength = most * epsilon**power
         if not strength <= STRONGEST:
             unit = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
             raise ValueError(f"expected |{name}|{unit} of at most {STRONGEST:g}, got {strength:.3g}")
-
-
-def _largest(value: float | Tensor) -> float:
-    """Return the largest modulus of a number or a tensor."""
-    return float(value.detach().abs().max()) if isinstance(value, Tensor) else abs(value)

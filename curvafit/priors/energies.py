@@ -45,7 +45,8 @@ def energy(
     """
     field = jet(u, grid)
     terms = energy_terms(field, epsilon).unbind(-4)
-    weighted = (_match_field(a, u) * term for a, term in zip(coefficients, terms, strict=True))
+    maps = (a.to(u) if isinstance(a, Tensor) else a for a in coefficients)
+    weighted = (a * term for a, term in zip(maps, terms, strict=True))
     per_voxel = sum(weighted, start=torch.zeros_like(u))
     if orientation is not None:
         check_orientation(orientation)
@@ -187,11 +188,6 @@ def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float) -> tuple[Tensor, 
     """Return ε/2 |∇u|² and W(u)/ε in every voxel."""
     slope2 = gradient(u, grid).square().sum(-4)
     return epsilon / 2 * slope2, double_well(u) / epsilon
-
-
-def _match_field(value: float | Tensor, u: Tensor) -> float | Tensor:
-    """Return a number unchanged, or a tensor in the field's type and on the field's device."""
-    return value.to(u) if isinstance(value, Tensor) else value
 
 
 def _as_finite(value: Any, expected: str, of: Any = None) -> Tensor:

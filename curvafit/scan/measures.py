@@ -469,7 +469,10 @@ def scan_diagram(prepared: Prepared) -> Diagram:
     """Measure the geometric curvature diagram of a prepared scan; places are in working units from the centre of the
     grid's first voxel. Raises NoSurface where there is none away from the scan's borders."""
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)
-    return diagram(np.ascontiguousarray(prepared.phase), prepared.grid, WORKING_EPSILON, where=where)
+    try:
+        return diagram(np.ascontiguousarray(prepared.phase), prepared.grid, WORKING_EPSILON, where=where)
+    except NoSurface:
+        raise NoSurface("expected a surface inside the scan, got none away from its borders") from None
 
 
 class Reading(NamedTuple):
