@@ -255,13 +255,6 @@ def test_a_scan_is_seen_as_a_kind_of_view() -> None:
     assert rounded is not None and rounded.view == "mask"
 
 
-def _quantile(measured, direction: np.ndarray, share: float) -> float:
-    values = measured.points @ direction
-    order = np.argsort(values)
-    cumulated = np.cumsum(measured.weights[order]) / measured.area
-    return float(values[order][np.searchsorted(cumulated, share)])
-
-
 @pytest.mark.slow
 def test_the_nearest_match_is_refined_by_gradients(tubes: np.ndarray) -> None:
     """By its descriptors as a mask, by its stationarity as a field; distances are geomloss's."""
